@@ -8,8 +8,7 @@ from rig.errors import EigenheadError
 
 
 class AddressTaken(EigenheadError):
-    """Reports that the service cannot listen at an address: another program uses the address, or it is not one of this
-    machine's."""
+    """Reports that the service cannot listen at an address: another program uses it or it is not this machine's."""
 
     def __init__(self, host: str, port: int, error: OSError) -> None:
         who = "another program listens there" if error.errno == errno.EADDRINUSE else error.strerror or str(error)

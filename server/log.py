@@ -1,6 +1,6 @@
-"""Writes log lines to standard error, for people or as JSON. Each line carries the id of its request or job.
+"""Writes log lines to standard error, for people or as JSON. Each log line carries the id of its request or job.
 
-Lines of libraries are written in the same form. A job that failed or was cancelled gets one log line, without the job
+Log lines of libraries have the same form. A job that failed or was cancelled gets one log line, without the job
 engine's traceback.
 """
 
@@ -23,8 +23,7 @@ def log_file(jobs: Path, job_id: str) -> Path:
 
 
 class JobLog:
-    """Writes each line about a job also to the job's own file, for everyone who may read the job. The class is a
-    processor of structlog.
+    """Writes, as a structlog processor, each line about a job also to the job's file, for all who may read the job.
 
     The job's file has no tracebacks, because these reveal internals of the service. A job whose folder was removed has
     no log.
@@ -56,8 +55,7 @@ class _OnStandardError(structlog.PrintLogger):
 
 
 def set_up(as_json: bool, level: str = "info", jobs: Path | None = None) -> None:
-    """Configures the logging of this process. ``jobs``: the folder of all jobs; if it is given, each job gets a log
-    file."""
+    """Configures the logging of this process. ``jobs``: the folder of all jobs, if each is to get a log file."""
     shared = [
         structlog.contextvars.merge_contextvars,
         structlog.processors.add_log_level,

@@ -40,12 +40,11 @@ def python_environment() -> dict[str, str]:
 
 
 def share_one_heap() -> None:
-    """Makes all threads of this process share one heap, if the C library is glibc. Callers must call the function
-    before any thread starts.
+    """Makes all threads of this process share one heap, if the C library is glibc; call this before any thread starts.
 
-    By default each thread has its own heap, and other threads cannot reuse its freed memory. With a heap for each
-    thread a default job needs 150 MB more and is no faster. The function also sets how often garbage is collected,
-    which takes 1.5 of a job's 31 s of CPU time.
+    By default each thread has its own heap, and other threads cannot reuse its freed memory. With such heaps a default
+    job needs 150 MB more and is no faster. The function also makes garbage collection rarer, which by default takes 1.5
+    of 31 CPU s.
     """
     import ctypes
 
@@ -58,8 +57,7 @@ def tidied(report: Progress) -> Progress:
     """Returns ``report``, extended for a job: whenever a stage begins, unused pages of this process's heap are returned
     to the system, which takes milliseconds and needs glibc.
 
-    Otherwise, because of arrays that still exist, glibc would keep freed memory: 110 MB after a default job's depth
-    maps.
+    Otherwise glibc would keep freed memory below existing arrays: 110 MB after a default job's depth maps.
     """
     import ctypes
 

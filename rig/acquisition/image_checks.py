@@ -131,8 +131,7 @@ def blur_px(image: ImageRgb) -> float | None:
 
 
 def register(image: ImageRgb, plate: ImageRgb) -> Registration:
-    """Measures the motion of the background from ``plate`` to ``image``, where a subject may hide parts of the
-    background.
+    """Measures the background's motion from ``plate`` to ``image``, where a subject may hide parts of the background.
 
     Normalised correlation, which does not depend on brightness and contrast, searches the picture for textured patches
     of the clean plate near their old positions. RANSAC finds the similarity transform that explains the motions of most
@@ -273,7 +272,7 @@ class SubjectPlace:
 
 def find_subject(image: ImageRgb, plate: ImageRgb) -> SubjectPlace | None:
     """Finds the subject as the largest region of a picture that differs from the clean plate. Returns None if no region
-    of a head's size differs."""
+    as large as a head differs."""
     if image.shape != plate.shape:
         return None
     here, there = (np.float32(_reduced(picture)) + 1.0 for picture in (image, plate))
@@ -284,8 +283,8 @@ def find_subject(image: ImageRgb, plate: ImageRgb) -> SubjectPlace | None:
 
 
 def subject_of_mask(mask: Bool[np.ndarray, "h w"]) -> SubjectPlace | None:
-    """Returns the subject's position in a picture with a known mask, or None if the mask has no region of a head's
-    size."""
+    """Returns the subject's position in a picture with a known mask; None if the mask has no region as large as a
+    head."""
     return _place(_reduced(mask.astype(np.uint8)) > 0, mask.shape)
 
 

@@ -146,8 +146,7 @@ def size_faults(images: Mapping[str, ImageRgb], rig: Rig) -> list[Fault]:
 
 
 class PlatesRefused(ShotFailed):
-    """Reports that new clean plates show a person. The old clean plates stay in use; the new ones are stored as
-    ``version``."""
+    """Reports that new clean plates show a person. The new plates are stored as ``version`` and not used."""
 
     def __init__(self, faults: Sequence[Fault], version: str) -> None:
         super().__init__(faults)

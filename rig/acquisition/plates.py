@@ -79,8 +79,7 @@ class PlatesVersion:
 
 
 def write_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]]) -> Plates:
-    """Writes new clean plates to ``folder``. When the new plates are complete, the old plates become a stored
-    version."""
+    """Writes new clean plates to ``folder``. When the new plates are complete, the old ones become a version."""
     return use_plates(folder, keep_plates(folder, images), tuple(images))
 
 

@@ -46,8 +46,7 @@ class _Release:
 
 
 class RigSession:
-    """Owns the devices of a rig while a block runs. The method ``close`` ends all threads except those that a driver
-    blocks."""
+    """Owns the devices of a rig while a block runs. ``close`` ends all threads except those that a driver blocks."""
 
     def __init__(self, config: RigConfig, make_driver: MakeDriver = driver_for) -> None:
         self.config = config
@@ -79,8 +78,7 @@ class RigSession:
         self.close()
 
     def open(self) -> None:
-        """Opens the cameras and the trigger box at once. A camera that cannot be opened is reported as a fault of each
-        shot."""
+        """Opens the cameras and the trigger box at once. A camera that cannot be opened is a fault of each shot."""
         for feed in self._feeds.values():
             feed.start()
         self._trigger.open()
@@ -89,8 +87,7 @@ class RigSession:
             feed.wait_opened(deadline_s)
 
     def close(self) -> tuple[str, ...]:
-        """Switches the lamps off and closes all devices. Returns the names of the cameras whose driver hangs. Safe to
-        call twice."""
+        """Switches the lamps off and closes all devices. Returns the cameras whose driver hangs. Safe to call twice."""
         self._trigger.close()
         deadline_s = time.monotonic() + _CLOSE_S
         for feed in self._feeds.values():
@@ -170,8 +167,7 @@ class RigSession:
             return self.plates
 
     def _glance(self) -> None:
-        """Stores each camera's picture before the cameras are released; if the shot shows the same picture, the stream
-        is frozen."""
+        """Stores each camera's picture before the release; if the shot shows the same picture, the stream is frozen."""
         now_s = time.monotonic()
         running = {name: s.period_s for name, feed in self._feeds.items() if (s := feed.state()).period_s is not None}
         for name in running:
@@ -211,8 +207,7 @@ class RigSession:
         return received
 
     def _release(self) -> _Release:
-        """Releases the cameras and returns the time that the trigger box reports or, without a trigger box, that of the
-        command."""
+        """Releases the cameras and returns when: the trigger box's time or, without a box, the time of the command."""
         now_s = time.monotonic()
         for feed in self._feeds.values():
             feed.want(now_s)

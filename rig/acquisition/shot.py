@@ -96,8 +96,7 @@ class Fault:
 
 
 def read_fault(document: Mapping[str, Any]) -> Fault:
-    """Reads a fault from the result of ``Fault.document``. Earlier versions of the program stored a fault's detail as a
-    text."""
+    """Reads a fault from the result of ``Fault.document``. Earlier versions stored a fault's detail as a text."""
     return Fault(document["code"], document["camera"], read_message(document.get("detail_message", document["detail"])))
 
 

@@ -26,8 +26,7 @@ BUSY_S = 1.5  # longest release: delay and pulse take up to 0.5 s each, and the 
 
 
 class TriggerError(EigenheadError):
-    """Reports that the trigger box did not execute a request. All other errors of this module are subclasses of
-    TriggerError."""
+    """Reports that the trigger box did not execute a request, and is the base class of this module's errors."""
 
 
 class TriggerUnplugged(TriggerError):
@@ -62,8 +61,7 @@ class TriggerRefused(TriggerError):
 
 @dataclass(frozen=True, slots=True)
 class BoxStatus:
-    """Holds the trigger box's answer to the request STATUS. ``bad_lines`` is the number of damaged lines that the
-    trigger box ignored."""
+    """Holds the trigger box's answer to STATUS. ``bad_lines`` is the number of damaged lines that the box ignored."""
 
     state: str
     shots: int
@@ -143,8 +141,7 @@ class TriggerBox:
         self._command(f"LIGHTS {mask:X}")
 
     def arm(self, window_s: float) -> None:
-        """Allows one call of ``fire`` within ``window_s`` seconds. After ``window_s`` seconds the trigger box disarms
-        itself."""
+        """Allows one call of ``fire`` within ``window_s`` seconds, after which the trigger box disarms itself."""
         self._command(f"ARM {round(window_s * 1000)}")
 
     def fire(self, mask: int, pulse_us: int) -> Fired:
@@ -157,8 +154,7 @@ class TriggerBox:
         return Fired(clock.host_from_box(box_us), clock.uncertainty_s, asked_s, shot)
 
     def status(self) -> BoxStatus:
-        """Returns the trigger box's state (IDLE, ARMED or FIRING), shots since power-up, lights, and count of damaged
-        lines."""
+        """Returns the box's state (IDLE, ARMED or FIRING), shots since power-up, lights, and count of damaged lines."""
         fields = _fields(self._command("STATUS"))
         try:
             return BoxStatus(fields["STATE"], int(fields["SHOTS"]), int(fields["LIGHTS"], 16), int(fields["BAD"]))
@@ -166,12 +162,10 @@ class TriggerBox:
             raise WrongDevice(self.port, f"STATUS {fields}") from error
 
     def synchronise(self, rounds: int = 5) -> BoxClock:
-        """Compares the trigger box's clock with time.monotonic ``rounds`` times, and returns the most precise
-        comparison.
+        """Compares the box's clock with time.monotonic ``rounds`` times, and returns the most precise comparison.
 
         By Cristian's method (Distributed Computing 3, 1989), the box reads its clock at some time during the round trip
-        of a request. The shortest round trip gives the narrowest bound; half its duration is the uncertainty of the
-        comparison.
+        of a request. The shortest round trip gives the narrowest bound; half its duration is the uncertainty.
         """
         best: BoxClock | None = None
         for _ in range(rounds):
@@ -191,8 +185,8 @@ class TriggerBox:
             raise WrongDevice(self.port, " ".join(words))
 
     def _command(self, body: str, attempts: int | None = None) -> list[str]:
-        """Sends the request ``body`` repeatedly until the trigger box answers, even while the box is busy. Returns the
-        words that follow OK in the reply."""
+        """Repeats the request ``body`` until the trigger box answers, even if busy. Returns the reply's words after
+        OK."""
         until_s = time.monotonic() + BUSY_S
         while True:
             with self._lock:
@@ -236,8 +230,7 @@ class TriggerBox:
 
 
 class RigTrigger:
-    """Holds the trigger box that rig.toml names. After an error the trigger box is closed, and its next use opens it
-    again.
+    """Holds the trigger box that rig.toml names. An error closes the trigger box, and its next use opens it.
 
     ``error``: why it cannot be used; None if it can, or if rig.toml names none."""
 
@@ -289,8 +282,7 @@ class RigTrigger:
                 time.sleep(lights.settle_s)
 
     def fire(self) -> Fired | None:
-        """Releases the cameras that wait for the trigger box. Returns None if the rig has no trigger box or the box
-        fails."""
+        """Releases the cameras that wait for the trigger box. Returns None if the rig has no box or the box fails."""
         trigger, cameras = self._config.trigger, self._config.cameras
         mask = sum(1 << c.channel for c in cameras if c.trigger == "external" and c.channel is not None)
         with self._attempt():

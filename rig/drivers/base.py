@@ -129,8 +129,7 @@ def driver_for(camera: CameraConfig, folder: Path) -> Driver:
 
 
 class Pace:
-    """Ticks ``fps`` times a second. A tick for which no call of ``wait`` is waiting is lost, as a camera's frame would
-    be."""
+    """Ticks ``fps`` times a second. A tick for which no call of ``wait`` waits is lost, like a camera's frame."""
 
     def __init__(self, fps: float) -> None:
         self._period_s = 1.0 / fps

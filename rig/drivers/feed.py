@@ -89,8 +89,7 @@ class CameraFeed:
             return self._opened
 
     def wait_frames(self, count: int, deadline_s: float) -> bool:
-        """Waits until the camera has delivered ``count`` frames since it was opened. Returns False if the deadline
-        passes first."""
+        """Waits until the camera has delivered ``count`` frames since it was opened; returns False at the deadline."""
         with self._changed:
             self._changed.wait_for(lambda: self._count >= count, _left(deadline_s))
             return self._count >= count

@@ -95,8 +95,7 @@ _MAY_FAIL: dict[str, tuple[Any, list[Any]]] = {
 
 
 class Aravis:
-    """Wraps the library libaravis. The method ``call`` runs a function of libaravis and converts a GError to
-    AravisError."""
+    """Wraps the library libaravis. ``call`` runs a function of libaravis and converts a GError to AravisError."""
 
     def __init__(self) -> None:
         self._aravis = ctypes.CDLL(LIBRARY)

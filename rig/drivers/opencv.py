@@ -359,8 +359,7 @@ def decode_jpeg(camera: CameraConfig, data: bytes) -> ImageRgb:
 
 
 def _is_taken(prop: int, wanted: float, actual: float) -> bool:
-    """Returns whether a camera took a value: a pixel format exactly, any other value within 5 %, because cameras round
-    values."""
+    """Returns whether a camera took a value: a pixel format exactly, others within 5 %, because cameras have steps."""
     return abs(actual - wanted) <= (0.0 if prop == cv2.CAP_PROP_FOURCC else _NEAR * abs(wanted))
 
 

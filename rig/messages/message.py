@@ -6,8 +6,7 @@ use only those of Python's format specifications that the console's ``messages.j
 The specification ``word`` marks a value that is translated, such as the state of a job; names are not translated.
 
 A new message needs: its code and template in a module of ``rig/messages/english``, its German in
-``server/console/static/messages_de.js``, and ``compose(code, ...)`` where it is used. Tests check that template, German
-text and use agree.
+``server/console/static/messages_de.js``, and ``compose(code, ...)`` where it is used. Tests check that these agree.
 """
 
 import math
@@ -30,8 +29,7 @@ FORMS = " | "
 
 
 def fields_of(template: str) -> dict[str, str]:
-    """Returns the format specification (or "") of every field of a template, and of ``count`` if the template has two
-    forms."""
+    """Returns the format specification (or "") of every field of a template, and of ``count`` if it has two forms."""
     fields = {name: specification or "" for name, specification in FIELD.findall(template)}
     return {"count": "", **fields} if FORMS in template else fields
 

@@ -113,8 +113,7 @@ def service_settings(**overrides: Any) -> Any:
 
 
 def _setting_fault(fault: Any, options: Mapping[str, object]) -> str:
-    """Returns a sentence on a fault that pydantic found, naming the option or the environment variable that holds the
-    wrong value."""
+    """Returns a sentence on a fault found by pydantic, naming the option or variable with the wrong value."""
     from server.settings import PREFIX
 
     field, *inner = map(str, fault["loc"])

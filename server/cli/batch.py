@@ -183,9 +183,8 @@ Clock = Callable[[], float]
 
 
 class BatchProgress:
-    """Counts the finished captures of a batch, which reconstructs ``workers`` captures at once. The remaining time is
-    estimated from the captures' mean duration or, until the first is done, from ``expected_s``. ``clock`` returns
-    monotonic seconds."""
+    """Counts finished captures of a batch, of which ``workers`` run at once. The remaining time is estimated from the
+    captures' mean duration or, until the first is done, from ``expected_s``. ``clock`` returns monotonic seconds."""
 
     def __init__(self, captures: int, workers: int, expected_s: float, clock: Clock = time.monotonic) -> None:
         self._captures, self._workers, self._expected_s, self._clock = captures, workers, expected_s, clock

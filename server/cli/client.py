@@ -94,8 +94,7 @@ class Client:
         return self._request("PUT", path, json=document).json()
 
     def delete(self, path: str) -> None:
-        """Sends a DELETE. Raises ServiceError if the service refuses the request, and Unreachable if it cannot be
-        reached."""
+        """Sends a DELETE. Raises ServiceError if the service refuses the request, and Unreachable without an answer."""
         self._request("DELETE", path)
 
     def upload(self, source: Path, *, report: Progress | None = None, **about: str) -> "JsonObject":
@@ -162,8 +161,7 @@ class Client:
 
     def download(self, job_id: str, folder: Path) -> list[Path]:
         """Writes the files of a job's result into ``folder``, replacing an earlier result, and returns their paths.
-        Raises ServiceError, without changing the folder, if a file does not have the SHA-256 that the service
-        states."""
+        Raises ServiceError, without changing the folder, if a file does not have its SHA-256."""
         job = self.get(f"/v1/jobs/{job_id}")
         with fresh_folder(folder) as fresh:
             for name, described in job["files"].items():

@@ -23,18 +23,16 @@ START_S = 60.0
 
 
 class ServiceDied(EigenheadError):
-    """Reports that the demo's service process ended before the demo did. The message has the end of the process's
-    log."""
+    """Reports that the demo's service process ended before the demo did. The message has the end of its log."""
 
     def __init__(self, log: Path) -> None:
         super().__init__(f"the service did not start:\n{log.read_text(errors='replace')[-2000:]}")
 
 
 def run_demo(out: Path, *, seed: int, full: bool, report: Progress) -> dict[str, Any]:
-    """Starts a service in a temporary data folder, triggers its simulated rig with the subject of ``seed``, submits a
-    job, waits for it, and downloads its result into ``out``. ``full``: whether to run the default job, with the dense
-    stage, instead of making a head at the lower level ``photo``. Returns what ``demo --json`` prints: files,
-    ``error_mm`` (the distance from the true head), and warnings."""
+    """Starts a service in a temporary data folder, triggers its simulated rig with the subject of ``seed``, runs a job,
+    and downloads the job's result into ``out``. ``full``: whether to run the default job, with the dense stage, or a
+    short job (level ``photo``). Returns what ``demo --json`` prints: files, ``error_mm`` from the truth, warnings."""
     began = time.monotonic()
     requested: dict[str, object] = {} if full else {"detail": "photo", "outputs": {"surface": "head"}}
     prepare_kernels(lambda stage, _: report(stage, 0.0), settings_from_document(requested))

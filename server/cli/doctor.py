@@ -147,8 +147,7 @@ def _database(settings: ServiceSettings) -> tuple[bool, str]:
 
 def _results(settings: ServiceSettings) -> tuple[bool, str]:
     """Compares the result files of succeeded jobs with their records, newest first, for ``COMPARE_S`` seconds. The
-    check names changed files, and jobs whose result folder is missing (removed by hand, or absent from a restored
-    backup)."""
+    check names changed files, and jobs without a result folder (removed by hand, or missing in a restored backup)."""
     kind = _kind(settings)
     connection = _connected(settings)
     if connection is None:
@@ -234,8 +233,7 @@ def _rig(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _stores(settings: ServiceSettings) -> tuple[bool, str]:
-    """Lists the first object of each object store; only the delivery of a result shows whether the service may write to
-    a store."""
+    """Lists the first object of each object store; whether the service may write there, only a delivery shows."""
     stores = [place for place in (settings.captures_store, settings.results_store) if place is not None]
     places = dict.fromkeys([*settings.import_prefixes, *settings.deliver_prefixes, *stores])
     if not places:

@@ -36,8 +36,7 @@ app = typer.Typer(rich_markup_mode=None)
 
 
 class LimitsMissed(EigenheadError):
-    """Reports that a figure of a verification exceeds its limit. The verification's report and certificate have already
-    been written."""
+    """Reports that a figure of a verification exceeds its limit. Report and certificate have already been written."""
 
     def __init__(self, document: "VerificationReport", out: Path) -> None:
         missed = [

@@ -60,8 +60,7 @@ def worker(
 
 
 def _worker_lives(settings: "ServiceSettings") -> bool:
-    """Returns whether a worker of this host is alive; returns True if the database cannot be reached, since workers
-    survive that."""
+    """Returns whether a worker of this host is alive; True if the database, whose loss workers survive, is away."""
     import platform
 
     import sqlalchemy as sa

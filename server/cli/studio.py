@@ -76,8 +76,7 @@ def serve_studio(
 
     Writes rig.toml, cameras.json and clean plates into ``folder``, and the true head into ``<folder>.truth``. ``ready``
     is called with ``describe_studio`` once all devices can be used. When the function returns, no thread, port or
-    pseudo-terminal is left. Raises InputError for a folder of another rig, an unknown simulated fault, or a port in
-    use.
+    pseudo-terminal is left. Raises InputError for a folder of another rig, an unknown fault, or a port in use.
     """
     planted = [device_fault_from_text(text) for text in faults]
     _check_folder(folder)

@@ -25,8 +25,7 @@ Corners = dict[str, list[list[float]]]  # of a shot, by camera: shares of the im
 
 def detect_shot(context: WorkerContext, report: Progress, *, files: str, board: Mapping[str, object]) -> Corners:
     """Finds the corners of the board in each image of a capture, in a child process. Returns the corners by camera, as
-    fractions of width and height; an image without a board gives an empty list. Raises InputError for an impossible
-    board."""
+    fractions of width and height; the list is empty without a board. Raises InputError for an impossible board."""
     described = board_from_document(board)
     corners = {}
     for number, path in enumerate(sorted((Path(files) / "images").iterdir())):

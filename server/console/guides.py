@@ -137,8 +137,7 @@ def predicted(
     rig: Rig, located: Mapping[str, Float[np.ndarray, " 3"]], landmarks: Mapping[str, Float[np.ndarray, " 3"]]
 ) -> dict[str, dict[str, list[float]]]:
     """Predicts the pixels of the model's landmarks in every view. The points in ``located`` (world frame, mm) determine
-    the pose of the mean head. Returns nothing if fewer than three points are landmarks, or if these landmarks lie on a
-    line."""
+    the mean head's pose. Returns nothing if fewer than three points are landmarks, or if they lie on a line."""
     names = [name for name in located if name in landmarks]
     if len(names) < POINTS_LEAST:
         return {}

@@ -82,8 +82,7 @@ def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
 
 
 def draw_first_view(service: Service, job_id: str) -> None:
-    """Draws the first view of a head before the page requests it. If the head was removed, the function raises no
-    error."""
+    """Draws the first view of a head before the page requests it. A head that was removed raises no error."""
     with suppress(EigenheadError, OSError):  # removed meanwhile, or a result without a head: the page tells
         head_picture(service, job_id, "first-view.jpg")
 

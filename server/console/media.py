@@ -162,8 +162,7 @@ def silhouette(who: Reader, capture_id: str, camera: str) -> Response:
 
 @pages.get("/console/captures/{capture_id}/faces")
 def faces(who: Reader, capture_id: str) -> Response:
-    """Returns the faces in a capture's pictures with their points (px). The first request searches the pictures for
-    faces."""
+    """Returns the faces in a capture's pictures with their points (px). The first request detects the faces."""
     return JSONResponse(found_faces(who[0], capture_id)["faces"], headers=FOREVER)
 
 
@@ -234,8 +233,7 @@ def cameras(who: Reader, job_id: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/photographs/{camera}.jpg")
 def photograph(who: Reader, job_id: str, camera: str) -> Response:
-    """Returns a photograph of the job's capture without lens distortion. The first request makes this picture, which is
-    then cached."""
+    """Returns a photograph of the job's capture without lens distortion, which the first request makes and caches."""
     service = who[0]
     capture, record = _capture_files(service, job_id)
     name = _image_name(record, camera)
@@ -384,8 +382,7 @@ def camera_views(rig: Rig, report: Report) -> list[JsonObject]:
 
 
 def rig_of(capture: Path) -> Rig:
-    """Reads the rig from the files of a capture. Raises InputError if the capture has no rig or the rig cannot be
-    read."""
+    """Reads the rig from the files of a capture. Raises InputError if there is no rig or the rig cannot be read."""
     rig_file = find_rig_file(capture)
     if rig_file is None:
         raise InputError("capture", [compose("no-cameras-json")])
@@ -463,8 +460,7 @@ def moved_onto(mine: Mesh, theirs: Mesh) -> Float[np.ndarray, "v 3"]:
 
 
 def found_faces(service: Service, identity: str) -> JsonObject:
-    """Returns the faces in a capture's pictures. The first call searches the pictures; later calls read the cache.
-    Blocks.
+    """Returns the faces in a capture's pictures. The first call detects the faces; later calls read the cache. Blocks.
 
     Raises NotFound, Conflict for a shot of the calibration board, InputError and WorkFailed if the pictures cannot be
     searched, and Unavailable after ``PATIENCE_S`` seconds.

@@ -276,8 +276,7 @@ def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: M
 
 
 def said_unless_refused(said: Message, done: BulkOut) -> Message:
-    """Returns the message about an action on many objects. Raises InvalidInput if the action was refused for some
-    objects."""
+    """Returns the message about an action on many objects. Raises InvalidInput if some objects were refused."""
     if done.refused:
         faults = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
         raise InvalidInput("some-refused", compose("some-refused", done=said, refused=len(faults)), faults)
@@ -316,8 +315,7 @@ def serve_page(name: str, page: type[Page], *, paths: Sequence[str], choices: Se
 
 
 async def show(name: str, page: type[Page], **initial: str | None) -> RedirectResponse | None:
-    """Shows ``page`` to a caller who is signed in. A caller who is not signed in is redirected to the page that asks
-    for an API key."""
+    """Shows ``page`` to a caller who is signed in; redirects other callers to the page that asks for an API key."""
     caller = await signed_in()
     if caller is None:
         return RedirectResponse("/sign-in")

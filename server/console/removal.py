@@ -1,8 +1,8 @@
 """Implements removal with undo: an object disappears from the pages at once and is removed a little later, unless a
-user undoes that.
+user undoes the removal.
 
-Waiting removals exist in this process only. If the service ends before, nothing is removed and the object appears
-again, which is the safe outcome.
+Removals that can be undone exist in this process only. If the service ends before a removal, the object appears again,
+which is the safe outcome.
 """
 
 import threading

@@ -65,8 +65,7 @@ class CalibrationPage(Page, component="calibration.js"):
 
 
 def known_calibrations(service: Service, age_s: float) -> list[CalibrationOut]:
-    """Returns all calibrations, newest first. The list of calibrations is shared by the pages and at most ``age_s``
-    seconds old."""
+    """Returns all calibrations, newest first. The pages share the list, which is at most ``age_s`` seconds old."""
     return shared.get("calibrations", age_s, service.calibrations.find)
 
 

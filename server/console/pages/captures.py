@@ -97,8 +97,7 @@ def sessions_list(service: Service, chosen: str | None = None) -> list[JsonObjec
 
 
 def session_line(session: SessionOut) -> JsonObject:
-    """Converts a session to an entry of a list. ``captures`` is the number of the session's captures, without those
-    that are being removed."""
+    """Converts a session to an entry of a list. ``captures`` counts the captures that are not being removed."""
     return session.model_dump() | {"captures": sum(capture not in removals for capture in session.captures)}
 
 
@@ -274,9 +273,8 @@ def discard(page: Page, event: JsonObject) -> None:
 
 
 def bulk(page: Page, event: JsonObject) -> Message | None:
-    """Applies one ``action`` to all ticked captures, ``ids``. ``id``: the session to which the captures are moved,
-    empty for none. If the action is refused for some captures, it is applied to the others, and InvalidInput is raised
-    with the reasons."""
+    """Applies one ``action`` to all ticked captures, ``ids``. ``id``: the session to move the captures to, or empty. An
+    action that is refused for some captures is applied to the others, and raises InvalidInput with the reasons."""
     service, ids, action = page.service, event["ids"], event["action"]
     if action == "reconstruct":
         permit(page.caller, "submit")

@@ -1,6 +1,6 @@
 """Implements the page Features, where the operator picks the paper's seven points (section 4.2) and others in views.
 
-This step is optional: without points the pipeline finds the alignment itself.
+Picking is optional: without points the pipeline finds the alignment itself.
 """
 
 import threading
@@ -164,8 +164,7 @@ landmarks = Landmarks()
 
 
 def place(page: FeaturesPage, event: JsonObject) -> None:
-    """Sets one ``point`` in the view of one ``camera``, or removes the point there if ``at`` is None. Saves nothing
-    yet."""
+    """Sets one ``point`` in the view of one ``camera``, or removes it if ``at`` is None. Saves nothing yet."""
     picked = page.of_capture()
     points = {name: dict(views) for name, views in picked.points.items()}
     views = points.setdefault(event["point"], {})

@@ -133,8 +133,7 @@ def log_lines(events: list[JobEvent]) -> list[JsonObject]:
 
 
 def restart(page: Page, event: JsonObject) -> Message:
-    """Queues a new job for the capture of an earlier job, and selects the new job. Raises what ``Jobs.restart``
-    raises."""
+    """Queues and selects a new job for the capture of an earlier job. Raises what ``Jobs.restart`` raises."""
     wanted = ReconstructionRequest(event.get("model") or None, chosen_settings(event))
     job = page.service.jobs.restart(event["id"], wanted, key=page.caller.key)
     page.choice["job"] = job.id

@@ -30,8 +30,7 @@ class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS
 
     def look(self) -> JsonObject:
         """Returns the shown head, which stays when new heads arrive, and the heads to choose from: the newest heads
-        that match the search, and the heads of the same subject. ``total`` is the number of heads that match the
-        search."""
+        that match the search, and the heads of the same subject. ``total`` counts the heads that match."""
         sought, chosen = self.choice.get("find") or "", self.choice.get("job")
         results, total = shared.get(("results", sought), 1.0, lambda: newest_heads(self.service, sought))
         if chosen is None:

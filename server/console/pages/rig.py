@@ -123,8 +123,7 @@ def moved_cameras(service: Service) -> set[str]:
 
 
 def read_report(service: Service, job_id: str) -> Report | None:
-    """Reads report.json of a finished job; None if the file is missing. The report is cached, since results do not
-    change."""
+    """Reads report.json of a finished job; None if it is missing. Reports are cached, since results never change."""
     path = service.store.folder("jobs", job_id) / "result" / "report.json"
 
     def read() -> Report | None:

@@ -58,8 +58,7 @@ class ServicePage(Page, component="service.js"):
 
 
 def key_lines(service: Service, caller: Caller) -> list[JsonObject]:
-    """Converts all API keys to entries of the list, oldest first. The entry of the key that ``caller`` uses is
-    marked."""
+    """Converts all API keys to entries of the list, oldest first. The key of ``caller`` is marked."""
     return [
         {
             "id": key.id,
@@ -137,8 +136,7 @@ def remove_failed(page: ServicePage, event: object) -> Message:
 
 
 def sweep_now(page: ServicePage, event: object) -> Message:
-    """Removes now what the retention settings would remove at the next regular removal. The returned message states how
-    much was removed."""
+    """Removes now what retention would remove next. The returned message states how much was removed."""
     gone = {kind: count for kind, count in sweep(page.service).items() if count}
     forget_storage(page.service)
     removed = [compose("gone-of-kind", count=count, kind=kind) for kind, count in gone.items()]
@@ -146,8 +144,7 @@ def sweep_now(page: ServicePage, event: object) -> Message:
 
 
 def forget_storage(service: Service) -> None:
-    """Drops the cached figures of the disk and of what retention removes next, so that these figures are computed
-    anew."""
+    """Drops the cached figures of the disk and of what retention removes next, which are then computed anew."""
     service.storage.forget()
     shared.forget("storage", "upcoming")
 
