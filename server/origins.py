@@ -3,7 +3,7 @@
 A caller who names an address must not turn the service against its own network (server-side request forgery). The
 service calls only origins that the operator listed; ``https://*`` stands for every public origin. The service looks up
 a host name once, and checks each address of the host. The service connects to a checked address, so a later change of a
-host name's address has no effect. Code that follows a redirection must check the new address, too.
+host name's address has no effect. Code that follows a redirection must check its address, too.
 """
 
 import ipaddress

@@ -43,8 +43,7 @@ def share_one_heap() -> None:
     """Makes all threads of this process share one heap, if the C library is glibc; call this before any thread starts.
 
     By default each thread has its own heap, and other threads cannot reuse its freed memory. With such heaps a default
-    job needs 150 MB more and is no faster. The function also makes garbage collection rarer, which by default takes 1.5
-    of 31 CPU s.
+    job needs 150 MB more. Garbage collection, which by default takes 1.5 of 31 CPU s, also becomes rarer.
     """
     import ctypes
 

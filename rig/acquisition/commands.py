@@ -150,8 +150,8 @@ def take_plates(config: RigConfig, make_driver: MakeDriver = driver_for) -> Plat
 
 
 def write_shot(out: Path, shot: Shot, plates: Plates, rig: Rig) -> None:
-    """Writes a shot as a capture folder with clean plates and the timing of the shot (shot.json). The folder appears
-    only when it is complete."""
+    """Writes a shot as a capture folder with clean plates and the timing of the shot (shot.json). The capture folder
+    appears only when it is complete."""
     out.parent.mkdir(parents=True, exist_ok=True)
     fresh = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
     try:

@@ -283,8 +283,7 @@ def find_subject(image: ImageRgb, plate: ImageRgb) -> SubjectPlace | None:
 
 
 def subject_of_mask(mask: Bool[np.ndarray, "h w"]) -> SubjectPlace | None:
-    """Returns the subject's position in a picture with a known mask; None if the mask has no region as large as a
-    head."""
+    """Returns the subject's position in a picture with a known mask; None if it has no region as large as a head."""
     return _place(_reduced(mask.astype(np.uint8)) > 0, mask.shape)
 
 

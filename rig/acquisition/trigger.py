@@ -185,8 +185,7 @@ class TriggerBox:
             raise WrongDevice(self.port, " ".join(words))
 
     def _command(self, body: str, attempts: int | None = None) -> list[str]:
-        """Repeats the request ``body`` until the trigger box answers, even if busy. Returns the reply's words after
-        OK."""
+        """Repeats the request ``body`` until the trigger box answers, even if busy. Returns the words after OK."""
         until_s = time.monotonic() + BUSY_S
         while True:
             with self._lock:

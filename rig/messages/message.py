@@ -5,8 +5,8 @@ A message's code is stable; its template (``rig/messages/english``) may be rewor
 use only those of Python's format specifications that the console's ``messages.js`` also supports (``SPECIFICATIONS``).
 The specification ``word`` marks a value that is translated, such as the state of a job; names are not translated.
 
-A new message needs: its code and template in a module of ``rig/messages/english``, its German in
-``server/console/static/messages_de.js``, and ``compose(code, ...)`` where it is used. Tests check that these agree.
+A new message needs, as tests check: its code and template in a module of ``rig/messages/english``, its German in
+``server/console/static/messages_de.js``, and ``compose(code, ...)`` where it is used.
 """
 
 import math

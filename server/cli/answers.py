@@ -158,7 +158,7 @@ def wrong_usage(option: str) -> Iterator[None]:
 def prepare_file(path: Path, *, overwrite: bool = True, option: str = "--out") -> None:
     """Makes the folder of an output file and checks, before any other work, that the file can be written.
 
-    Raises CannotWrite if it cannot, and Overwrites if the file exists and ``overwrite`` is false."""
+    Raises CannotWrite for an unwritable path, and Overwrites if the file exists and ``overwrite`` is false."""
     if path.exists() and not overwrite:
         raise Overwrites(path, "place" if option == "--out" else option)
     try:

@@ -58,7 +58,7 @@ class ServicePage(Page, component="service.js"):
 
 
 def key_lines(service: Service, caller: Caller) -> list[JsonObject]:
-    """Converts all API keys to entries of the list, oldest first. The key of ``caller`` is marked."""
+    """Converts all API keys to entries of the list, oldest first. The API key of ``caller`` is marked."""
     return [
         {
             "id": key.id,

@@ -35,7 +35,7 @@ class SignIn(Element, component="sign_in.js"):
 
 @ui.page("/sign-in")
 async def sign_in_page() -> None:
-    """Serves the page that asks for an API key. If no API key is needed, it redirects to the page Rig."""
+    """Serves the page that asks for an API key, or redirects to the page Rig if no API key is needed."""
     ui.page_title("Sign in - eigenhead")
     caller = await signed_in()
     if caller is not None and caller.key == "local":

@@ -66,8 +66,8 @@ class BatchList(Listed):
 def submit_batch(
     service: ServiceOf, caller: Submitter, wanted: NewBatch, response: Response, idempotency_key: Idempotency = None
 ) -> BatchOut:
-    """Queues a job for each of many captures, behind the jobs of other users. The same Idempotency-Key with the same
-    request returns the first batch."""
+    """Queues a job for each of many captures, behind the jobs of other users. Repeating the request with the same
+    Idempotency-Key returns the first batch."""
     request = BatchRequest(
         ReconstructionRequest(wanted.model, wanted.settings, deliver_to=wanted.deliver_to),
         wanted.captures,
@@ -118,8 +118,8 @@ def resume_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchO
 
 @router.post("/batches/{batch_id}/cancel", responses=documented(404))
 def cancel_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
-    """Cancels a batch's jobs that have not ended; they cannot be resumed. Results stay. Cancelling has no effect on a
-    batch that has ended."""
+    """Cancels a batch's jobs that have not ended; cancelled jobs cannot be resumed. Results stay. Cancelling has no
+    effect on a batch that has ended."""
     return service.batches.cancel(batch_id)
 
 

@@ -197,7 +197,7 @@ def delete_capture(
     erase: Annotated[bool, Query(description="its jobs and heads, too, for good")] = False,
 ) -> None:
     """Removes a capture with its images. The capture's jobs and their results, which show the face, stay. Answers 409
-    while a queued or running job needs it.
+    while a queued or running job needs the capture.
 
     With ``erase``, which needs the scope ``erase``, the capture's jobs are cancelled and removed with their results.
     """
@@ -218,8 +218,8 @@ def delete_capture(
 async def reconstruct_upload(
     service: ServiceOf, caller: Submitter, request: Request, response: Response, idempotency_key: Idempotency = None
 ) -> JobOut:
-    """Receives a capture and queues a job for it in one call. The same Idempotency-Key with the same files and settings
-    returns the first job."""
+    """Receives a capture and queues a job for it in one call. Repeating the request with the same Idempotency-Key,
+    files and settings returns the first job."""
     record, fields = await receive_capture(service, request, caller.key, (*ABOUT, *OF_JOB))
     try:
         name = (fields.get("name") or "")[:TEXT_MOST]

@@ -52,7 +52,7 @@ EXPORT: Responses = {200: {"content": {"application/zip": {}}}, **documented(400
 def submit_job(
     service: ServiceOf, caller: Submitter, wanted: NewJob, response: Response, idempotency_key: Idempotency = None
 ) -> JobOut:
-    """Queues a reconstruction. The same Idempotency-Key with the same request returns the first job."""
+    """Queues a reconstruction. Repeating the request with the same Idempotency-Key returns the first job."""
     hook: JobWebhook | None = wanted.webhook and {"url": wanted.webhook.url, "secret": wanted.webhook.secret}
     job = service.jobs.submit(
         wanted.capture_id,
@@ -99,7 +99,7 @@ def list_jobs(
 
 @router.post("/jobs/bulk", responses=documented(400, 413, 415, 507))
 def change_jobs(service: ServiceOf, caller: Submitter, wanted: JobBulk) -> BulkOut:
-    """Applies one action to many jobs. Jobs to which it cannot be applied are reported and do not stop the others."""
+    """Applies one action to many jobs. Jobs that cannot take the action are reported and do not stop the others."""
     actions: dict[str, Callable[[str], object]] = {
         "cancel": service.cancel,
         "restart": lambda job: service.jobs.restart(job, ReconstructionRequest(), key=caller.key),
