@@ -1,5 +1,5 @@
 """Makes heads available to users by an HTTP service with pages, workers and a command line.
 
-It is the only package that imports the web framework and the job engine. For each head it calls
+The package ``server`` alone imports the web framework and the job engine. For each head the service calls
 ``pipeline.reconstruct.reconstruct`` once.
 """

@@ -8,7 +8,7 @@ from rig.errors import EigenheadError
 
 
 class AddressTaken(EigenheadError):
-    """Reports that the service cannot listen at an address: another program uses it, or it is not this machine's."""
+    """Reports that the service cannot listen at an address: another program uses it or it is not this machine's."""
 
     def __init__(self, host: str, port: int, error: OSError) -> None:
         who = "another program listens there" if error.errno == errno.EADDRINUSE else error.strerror or str(error)
@@ -16,7 +16,7 @@ class AddressTaken(EigenheadError):
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Opens a listening socket. Port 0 chooses a free one. Raises AddressTaken."""
+    """Opens a listening socket. Port 0 chooses a free port. Raises AddressTaken."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     sock = socket.socket(family, socket.SOCK_STREAM)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -16,7 +16,7 @@ UNWRITABLE = (errno.EROFS, errno.EACCES, errno.EPERM)
 
 
 class Refused(EigenheadError):
-    """Refuses a request. It is the base of all refusals; ``retry_after_s`` is the time after which to try again."""
+    """Refuses a request; all refusals are subclasses. After ``retry_after_s`` seconds the caller may try again."""
 
     def __init__(
         self,

@@ -1,6 +1,6 @@
-"""Writes log lines to standard error, for people or as JSON. Each line carries the id of its request or job.
+"""Writes log lines to standard error, for people or as JSON. Each log line carries the id of its request or job.
 
-Lines of libraries are written in the same form. A job that failed or was cancelled gets one line, without the job
+Log lines of libraries have the same form. A job that failed or was cancelled gets one log line, without the job
 engine's traceback.
 """
 
@@ -23,17 +23,17 @@ def log_file(jobs: Path, job_id: str) -> Path:
 
 
 class JobLog:
-    """Writes each line about a job also to the job's own file, for everyone who may read the job. It is a processor of
-    structlog.
+    """Writes, as a structlog processor, each line about a job also to the job's file, for all who may read the job.
 
-    Tracebacks are left out, because they reveal internals of the service. A job whose folder was removed has no log.
+    The job's file has no tracebacks, because these reveal internals of the service. A job whose folder was removed has
+    no log.
     """
 
     def __init__(self, jobs: Path) -> None:
         self._jobs = jobs
 
     def __call__(self, logger: object, method: str, event: EventDict) -> EventDict:
-        """Writes one line to its job's file, if it is about a job, and returns the line unchanged."""
+        """Writes a log line that is about a job to the job's file, and returns every line unchanged."""
         if "job" in event and log_file(self._jobs, str(event["job"])).parent.is_dir():
             public = {key: value for key, value in event.items() if key not in NOT_FOR_CALLERS}
             words = " ".join(f"{key}={value}" for key, value in public.items())
@@ -55,7 +55,7 @@ class _OnStandardError(structlog.PrintLogger):
 
 
 def set_up(as_json: bool, level: str = "info", jobs: Path | None = None) -> None:
-    """Configures the logging of this process. ``jobs``: the folder of all jobs; with it each job gets a log file."""
+    """Configures the logging of this process. ``jobs``: the folder of all jobs, if each is to get a log file."""
     shared = [
         structlog.contextvars.merge_contextvars,
         structlog.processors.add_log_level,
@@ -87,7 +87,7 @@ def set_up(as_json: bool, level: str = "info", jobs: Path | None = None) -> None
 
 def is_no_known_failure(record: logging.LogRecord) -> bool:
     """Returns False for a log record with the traceback of a job that failed for a known reason or was cancelled, or of
-    a webhook that did not answer, because these have their own log lines; otherwise True."""
+    a webhook that did not answer, because such failures have their own log lines."""
     error = record.exc_info[1] if record.exc_info else None
     if error is None:
         return True

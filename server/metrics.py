@@ -11,7 +11,7 @@ LAGS = (0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0)  # s, of the event loop
 
 
 class Metrics:
-    """Holds the metrics of one app. Each object has its own registry, so that two apps in one process do not mix."""
+    """Holds the metrics of one app, in its own registry, so that the metrics of two apps in one process do not mix."""
 
     def __init__(self) -> None:
         self.registry = registry = CollectorRegistry()

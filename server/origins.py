@@ -1,9 +1,9 @@
 """Decides which other servers this service may call on behalf of a caller, and at which address.
 
 A caller who names an address must not turn the service against its own network (server-side request forgery). The
-service calls only origins that the operator listed; ``https://*`` stands for every public origin. A name is looked up
-once, and each of its addresses is checked. The connection then goes to a checked address, so a later change of the
-name's address has no effect. Code that follows a redirection must check the new address in the same way.
+service calls only origins that the operator listed; ``https://*`` stands for every public origin. The service looks up
+a host name once, and checks each address of the host. The service connects to a checked address, so a later change of a
+host name's address has no effect. Code that follows a redirection must check its address, too.
 """
 
 import ipaddress
@@ -36,8 +36,8 @@ class Target:
 
 
 def target(url: str, origins: Collection[str]) -> Target:
-    """Checks ``url`` and returns where to connect. ``origins``: the origins that the operator allows. Blocks during the
-    name lookup.
+    """Checks ``url`` and returns where to connect. ``origins``: the origins that the operator allows. The function
+    blocks while it looks up the host name.
 
     Raises InvalidInput ("url-refused") for an address that is malformed, not allowed, or not public.
     """
@@ -59,8 +59,8 @@ def target(url: str, origins: Collection[str]) -> Target:
 
 
 def parsed(url: str) -> httpx.URL:
-    """Parses a web address, without looking up its host. Raises InvalidInput ("url-refused") if it is not a URL, is not
-    http(s), or names a host that cannot exist."""
+    """Parses a web address, without looking up its host. Raises InvalidInput ("url-refused") if the text is not a URL,
+    is not http(s), or names a host that cannot exist."""
     try:
         wanted = httpx.URL(url)
         shown, host = wanted.host, wanted.raw_host.decode("ascii")  # httpx decodes a host no sooner than it is asked
@@ -75,7 +75,7 @@ def parsed(url: str) -> httpx.URL:
 
 
 def origin_of(url: httpx.URL) -> str:
-    """Returns scheme://host of a URL, with the port if it is not the scheme's default."""
+    """Returns scheme://host of a URL, with the port if this is not the scheme's default."""
     port = "" if url.port in (None, PORTS.get(url.scheme)) else f":{url.port}"
     host = url.raw_host.decode("ascii").lower()
     return f"{url.scheme}://{f'[{host}]' if ':' in host else host}{port}"

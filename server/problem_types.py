@@ -1,9 +1,9 @@
 """Lists the public type of every problem and of every failed job, with its title: stable names on which programs may
 rely.
 
-Types are listed explicitly, and a title is the words of its type. They are not derived from class names or messages,
-which may change: a renamed class keeps its type by an entry in ``FAILURE_TYPES``. On the wire
-``urn:eigenhead:problem:`` stands before a type.
+A title is the words of its type. Types are listed explicitly, not derived from class names or messages, which may
+change: a renamed class keeps its type by an entry in ``FAILURE_TYPES``. In an HTTP answer ``urn:eigenhead:problem:``
+stands before a type.
 """
 
 URN = "urn:eigenhead:problem:"
@@ -84,11 +84,11 @@ HTTP_TYPES = {
 
 
 def type_of_input(subject: str) -> str:
-    """Returns the stable name of the problem for an ``InputError`` with this subject."""
+    """Returns the stable name of the problem for an ``InputError`` about ``subject``."""
     return INPUT_TYPES.get(subject, "invalid-input")
 
 
 def type_of_failure(kind: str) -> str:
-    """Returns the stable name of the problem for failed work. ``kind``: the class of its error, or how its child
-    process ended."""
+    """Returns the stable name of the problem for failed work. ``kind``: the class of the work's error, or how the
+    work's child process ended."""
     return FAILURE_TYPES.get(kind, "eigenhead-error")

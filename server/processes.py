@@ -1,8 +1,8 @@
 """Starts Python processes that run this package's own code, and identifies processes: the worker beside the service,
 and the children that do heavy work.
 
-These processes must run the code of this installation, even if a folder with the name of one of its packages lies in
-the working directory or on PYTHONPATH.
+Started processes must run this installation's code, even if a folder with the name of one of its packages lies in the
+working directory or on PYTHONPATH.
 """
 
 import gc
@@ -30,7 +30,7 @@ def python_command(module: str, *arguments: str) -> list[str]:
 def python_environment() -> dict[str, str]:
     """Returns this process's environment variables, with the checkout put before everything else on PYTHONPATH.
 
-    In the wheel the package has a unique name, so the variables stay unchanged.
+    If the program was installed from a wheel, the variables stay unchanged, because the package has a unique name.
     """
     if "." in SERVER:
         return dict(os.environ)
@@ -40,10 +40,10 @@ def python_environment() -> dict[str, str]:
 
 
 def share_one_heap() -> None:
-    """Makes all threads of this process share one heap, if the C library is glibc. Call it before any thread starts.
+    """Makes all threads of this process share one heap, if the C library is glibc; call this before any thread starts.
 
-    By default each thread has its own heap, and other threads cannot reuse its freed memory. A default job then needs
-    150 MB more and is no faster. It also makes garbage collection so frequent that it takes 1.5 of 31 CPU s.
+    By default each thread has its own heap, and other threads cannot reuse its freed memory. With such heaps a default
+    job needs 150 MB more. Garbage collection, which by default takes 1.5 of 31 CPU s, also becomes rarer.
     """
     import ctypes
 
@@ -56,7 +56,7 @@ def tidied(report: Progress) -> Progress:
     """Returns ``report``, extended for a job: whenever a stage begins, unused pages of this process's heap are returned
     to the system, which takes milliseconds and needs glibc.
 
-    Without this, glibc keeps freed memory below arrays that still exist: 110 MB after a default job's depth maps.
+    Otherwise glibc would keep freed memory below existing arrays: 110 MB after a default job's depth maps.
     """
     import ctypes
 
@@ -93,7 +93,7 @@ def process_started(pid: int) -> int:
 def end_with_parent(parent: int) -> None:
     """Makes the kernel kill this process when the thread that started it ends; ``parent`` is that thread's process.
 
-    Otherwise a child process would continue to write and hold memory after a SIGKILL of its parent. Works on Linux
+    A child process would otherwise continue to write and to hold memory after a SIGKILL of its parent. Works on Linux
     only.
     """
     import ctypes

@@ -1,5 +1,5 @@
-"""Defines the settings of the service, which come from the command line, from EIGENHEAD_* variables, or from these
-defaults."""
+"""Defines the settings of the service, which come from the command line, from EIGENHEAD_* variables, or from this
+module's defaults."""
 
 import json
 import re
@@ -179,8 +179,8 @@ class ServiceSettings(BaseSettings):
     def url(self) -> str:
         """Returns the database's URL in SQLAlchemy's form.
 
-        PostgreSQL is set to end a session that is idle inside a transaction: otherwise a vanished worker would keep its
-        row locks, and no other worker could take over its job.
+        In the URL PostgreSQL is told to end a session that is idle inside a transaction: otherwise a vanished worker
+        would keep its row locks, and no other worker could take over its job.
         """
         if self.database_url is None:
             return f"sqlite:///{self.data.resolve() / 'eigenhead.sqlite'}"
@@ -210,6 +210,6 @@ class ServiceSettings(BaseSettings):
 
 
 def variable_in(error: SettingsError) -> str:
-    """Returns the environment variable whose value could not be decoded. pydantic names its field only in the error's
-    text."""
+    """Returns the environment variable whose value could not be decoded; pydantic names the variable's field only in
+    the error's text."""
     return next((PREFIX + name.upper() for name in ServiceSettings.model_fields if f'"{name}"' in str(error)), PREFIX)

@@ -1,3 +1,3 @@
-"""Takes shots with a camera rig: triggers the cameras, collects their simultaneous pictures, and judges these.
+"""Takes shots with a camera rig: triggers the cameras, collects and judges their simultaneous pictures.
 
 The input is rig.toml and the devices that it lists. The output is capture folders, or faults with remedies."""

@@ -37,7 +37,7 @@ COLUMNS = ("camera", "found", "resolution", "fps", "exposure", "sharpness", "syn
 
 
 class NoCalibration(EigenheadError):
-    """Reports a rig without calibration. No capture folder can be written, because it must contain cameras.json."""
+    """Reports a rig without calibration. A capture folder needs the calibration for its cameras.json."""
 
     def __init__(self) -> None:
         super().__init__(compose("rig-without-calibration"))
@@ -79,8 +79,8 @@ def capture(
 ) -> Shot:
     """Takes one shot and writes it as the capture folder ``out``. Reports the stages "warm up", "shot" and "done".
 
-    Writes nothing and raises ShotFailed if the shot has an error. Raises NoCalibration for a rig without calibration,
-    and InputError if ``out`` is not empty. The returned shot and the file shot.json contain the warnings.
+    Raises ShotFailed without writing anything if the shot has an error. Raises NoCalibration for a rig without
+    calibration, and InputError if ``out`` is not empty. The returned shot and the file shot.json contain the warnings.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(str(out), [compose("folder-exists")])
@@ -110,9 +110,9 @@ def board_shots(
 ) -> Iterator[tuple[str, tuple[str, ...], tuple[Fault, ...]]]:
     """Takes ``count`` shots of a calibration board and writes ``out/<camera>/<shot>.png`` for `eigenhead calibrate`.
 
-    Yields each shot's name, the cameras whose pictures were written, and the faults. Waits ``pause_s`` before each
-    shot, so that the board can be moved. Never overwrites earlier shots in ``out``. Raises ShotFailed if no camera
-    delivers a picture.
+    Yields each shot's name, the cameras whose pictures were written, and the faults. Waits ``pause_s`` seconds before
+    each shot, so that a person can move the board. Never overwrites earlier shots in ``out``. Raises ShotFailed if no
+    camera delivers a picture.
     """
     taken = {path.stem for path in out.glob("*/*.png")}
     names = (name for name in map("shot{:03}".format, itertools.count()) if name not in taken)
@@ -129,8 +129,8 @@ def board_shots(
 def board_shot(session: RigSession) -> Shot:
     """Takes one shot of a calibration board with an open session. The rig needs neither calibration nor clean plates.
 
-    Returns the pictures that cameras delivered, and the faults. Faults that the board causes by hiding the background
-    are left out. Raises ShotFailed if no camera delivers a picture.
+    Returns the pictures that cameras delivered, and the faults. Leaves out the faults that the calibration board causes
+    by hiding the background. Raises ShotFailed if no camera delivers a picture.
     """
     shot = session.shoot()
     faults = tuple(fault for fault in shot.faults if fault.code not in HIDDEN_BY_BOARD)
@@ -150,8 +150,8 @@ def take_plates(config: RigConfig, make_driver: MakeDriver = driver_for) -> Plat
 
 
 def write_shot(out: Path, shot: Shot, plates: Plates, rig: Rig) -> None:
-    """Writes a shot as a capture folder with clean plates and the timing of the shot (shot.json). The folder appears
-    only when it is complete."""
+    """Writes a shot as a capture folder with clean plates and the timing of the shot (shot.json). The capture folder
+    appears only when it is complete."""
     out.parent.mkdir(parents=True, exist_ok=True)
     fresh = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
     try:

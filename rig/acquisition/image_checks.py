@@ -84,7 +84,7 @@ def noise_of(plates: Sequence[ImageRgb]) -> float | None:
     """Computes the standard deviation of the temporal noise from pictures of a static scene; None for one picture.
 
     The difference of successive pictures has the variance 2 sigma^2. The variance is computed within blocks of 16 px,
-    where drifting light hardly matters. The median over all blocks ignores motion in a few of them.
+    where drifting light hardly matters. The median over all blocks ignores motion in a few blocks.
     """
     variances = [_block_variance(after, before) for before, after in itertools.pairwise(plates)]
     return float(np.sqrt(np.median(variances) / 2)) if variances else None
@@ -108,8 +108,8 @@ def blur_px(image: ImageRgb) -> float | None:
     Returns None if the picture has no edges.
 
     A step of height A, blurred with standard deviation s, has the gradient energy A^2 / (2 sqrt(pi) s) across it.
-    Blurring the picture further, by known s1 and by s2, gives energies whose ratio q = sqrt((s^2 + s2^2) / (s^2 +
-    s1^2)) is the same for every A; it is solved for s. Only pixels with the strongest gradients are used,
+    Blurring the picture further, by known s1 and by s2, gives energies with the ratio q = sqrt((s^2 + s2^2) / (s^2 +
+    s1^2)), which is the same for every height A and is solved for s. Only pixels with the strongest gradients are used,
     because they lie on steps. The energy of the noise, measured in other pixels, is subtracted first.
     """
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.float32)
@@ -131,11 +131,11 @@ def blur_px(image: ImageRgb) -> float | None:
 
 
 def register(image: ImageRgb, plate: ImageRgb) -> Registration:
-    """Measures the motion of the background from ``plate`` to ``image``, in which a subject may hide parts of it.
+    """Measures the background's motion from ``plate`` to ``image``, where a subject may hide parts of the background.
 
-    Normalised correlation, which does not depend on brightness and contrast, searches textured patches of the plate
-    near their old positions. RANSAC finds the similarity that explains most motions; ``found`` counts the patches that
-    agree with it.
+    Normalised correlation, which does not depend on brightness and contrast, searches the picture for textured patches
+    of the clean plate near their old positions. RANSAC finds the similarity transform that explains the motions of most
+    patches; ``found`` counts these patches.
     """
     if image.shape != plate.shape:
         return Registration(_PATCHES_MOST, 0.0, 0.0)
@@ -240,8 +240,8 @@ def _corner_deviation(
 ) -> float:
     """Returns the largest standard deviation (px), over the image corners, of a similarity fitted to points.
 
-    In complex numbers, a similarity multiplies ``x - mean`` by a factor and adds a shift. The variance of the factor is
-    sigma^2 over the sum of |x - mean|^2, that of the shift is sigma^2 / n.
+    In complex numbers, a similarity transform multiplies ``x - mean`` by a factor and adds a shift. The similarity's
+    factor has the variance sigma^2 over the sum of |x - mean|^2, and its shift has the variance sigma^2 / n.
     """
     residuals = target - source @ similarity[:, :2].T - similarity[:, 2]
     variance = float((residuals**2).sum()) / (2 * len(source) - 4)  # per coordinate, four parameters
@@ -272,7 +272,7 @@ class SubjectPlace:
 
 def find_subject(image: ImageRgb, plate: ImageRgb) -> SubjectPlace | None:
     """Finds the subject as the largest region of a picture that differs from the clean plate. Returns None if no region
-    of a head's size differs."""
+    as large as a head differs."""
     if image.shape != plate.shape:
         return None
     here, there = (np.float32(_reduced(picture)) + 1.0 for picture in (image, plate))
@@ -283,7 +283,7 @@ def find_subject(image: ImageRgb, plate: ImageRgb) -> SubjectPlace | None:
 
 
 def subject_of_mask(mask: Bool[np.ndarray, "h w"]) -> SubjectPlace | None:
-    """Returns the subject's position in a picture with a known mask, or None if it has no region of a head's size."""
+    """Returns the subject's position in a picture with a known mask; None if it has no region as large as a head."""
     return _place(_reduced(mask.astype(np.uint8)) > 0, mask.shape)
 
 

@@ -1,5 +1,5 @@
-"""Judges the light, the focus and the cameras' views in the pictures of a shot. Also judges whether new clean plates
-show an empty studio, from their light, from motion between them, and by comparison with the plates in use."""
+"""Judges the light, the focus and the cameras' views in the pictures of a shot. The module also judges whether new
+clean plates show an empty studio: by their light, by motion between them, and by comparison with the plates in use."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -146,7 +146,7 @@ def size_faults(images: Mapping[str, ImageRgb], rig: Rig) -> list[Fault]:
 
 
 class PlatesRefused(ShotFailed):
-    """Reports that new plates show a person. The old plates stay in use; the new plates are stored as ``version``."""
+    """Reports that new clean plates show a person. The new plates are stored as ``version`` and not used."""
 
     def __init__(self, faults: Sequence[Fault], version: str) -> None:
         super().__init__(faults)

@@ -33,7 +33,7 @@ UNFINISHED_S = 3600.0  # no version takes so long to write
 @dataclass(frozen=True, slots=True, eq=False)
 class Plates:
     """Holds the clean plates by camera: files, the first plate as an image, and the noise (standard deviation of the
-    values, 0 to 255). The noise is None for a single plate."""
+    values, 0 to 255). The noise is None if a camera has a single plate."""
 
     files: Mapping[str, tuple[Path, ...]]
     first: Mapping[str, ImageRgb]
@@ -48,8 +48,8 @@ NO_PLATES = Plates({}, {}, {}, None)
 
 
 def read_plates(folder: Path, names: tuple[str, ...]) -> Plates:
-    """Reads the clean plates in ``folder``, for cameras that have any. Raises InputError for a file that is no
-    picture."""
+    """Reads the clean plates in ``folder`` for those of the cameras that have any. Raises InputError for a file that is
+    no picture."""
     files = {name: paths for name in names if (paths := _files(folder, name))}
     with ThreadPoolExecutor(4) as pool:
         first = dict(zip(files, pool.map(lambda paths: read_image(paths[0]), files.values()), strict=True))
@@ -79,13 +79,13 @@ class PlatesVersion:
 
 
 def write_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]]) -> Plates:
-    """Writes new clean plates to ``folder``. When they are complete, the old plates become a version."""
+    """Writes new clean plates to ``folder``. When the new plates are complete, the old ones become a version."""
     return use_plates(folder, keep_plates(folder, images), tuple(images))
 
 
 def keep_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]], refused: tuple[Message, ...] = ()) -> str:
     """Writes clean plates as a version that is not in use, and returns the version's id. ``refused`` lists the faults
-    that prevent their use."""
+    that prevent the use of these clean plates."""
     moment = datetime.now(UTC)
     identity = moment.strftime("%Y%m%dT%H%M%S%fZ")
     _remove_unfinished(folder)
@@ -144,7 +144,7 @@ def plates_versions(folder: Path) -> list[PlatesVersion]:
 
 
 def _version_of(folder: Path) -> PlatesVersion:
-    """Reads a version's description from plates.json. Without it, uses the folder's modification time."""
+    """Reads a version's description from plates.json, or without that file uses the folder's modification time."""
     try:
         document = json.loads((folder / "plates.json").read_text(encoding="utf-8"))
         taken = str(document["taken"])

@@ -4,8 +4,8 @@
         session.warm_up()
         shot = session.shoot()
 
-Every wait has a deadline, and no camera delays another: each has its own thread (rig.drivers.feed). Failures are faults
-of the shot; an exception means that there is no shot at all (ShotFailed, InputError).
+Every wait has a deadline, and no camera delays another, because each camera has its own thread (rig.drivers.feed). A
+failing device is a fault of the shot; an exception (ShotFailed, InputError) means that there is no shot at all.
 """
 
 import threading
@@ -46,7 +46,7 @@ class _Release:
 
 
 class RigSession:
-    """Owns the devices of a rig while a block runs. ``close`` ends all threads except those blocked in a driver."""
+    """Owns the devices of a rig while a block runs. ``close`` ends all threads except those that a driver blocks."""
 
     def __init__(self, config: RigConfig, make_driver: MakeDriver = driver_for) -> None:
         self.config = config
@@ -78,7 +78,7 @@ class RigSession:
         self.close()
 
     def open(self) -> None:
-        """Opens the cameras and the trigger box at once. A camera that does not open is a fault of each shot."""
+        """Opens the cameras and the trigger box at once. A camera that cannot be opened is a fault of each shot."""
         for feed in self._feeds.values():
             feed.start()
         self._trigger.open()
@@ -97,11 +97,11 @@ class RigSession:
         return hanging
 
     def states(self) -> Mapping[str, FeedState]:
-        """Returns the current state of each camera, by name. Cameras without a driver are left out."""
+        """Returns the current state of each camera that has a driver, by name."""
         return {name: feed.state() for name, feed in self._feeds.items()}
 
     def trigger_error(self) -> Message | None:
-        """Returns why the trigger box cannot be used; None if it can, or if rig.toml names none."""
+        """Returns why the trigger box cannot be used; None if it can be used, or if rig.toml names no trigger box."""
         return None if self._trigger.error is None else self._trigger.error.message
 
     def _trigger_faults(self) -> tuple[Fault, ...]:
@@ -120,14 +120,14 @@ class RigSession:
 
     def look(self, only: Collection[str] | None = None) -> Mapping[str, ImageRgb]:
         """Returns a current picture of each camera that delivers one, without synchronisation. ``only`` names the
-        cameras; None takes all."""
+        cameras to take pictures with; None means all cameras."""
         with self._busy:
             self._trigger.switch_lamps_on()
             frames = self._next_frames(time.monotonic() + 2 * self.config.shot.timeout_s, only)
             return {name: frame.image for name, frame in frames.items()}
 
     def shoot(self) -> Shot:
-        """Takes one synchronised shot. It raises nothing for a failing device: the shot's faults say what is wrong."""
+        """Takes one synchronised shot. A failing device raises no exception: the shot's faults say what is wrong."""
         with self._busy:
             self._trigger.switch_lamps_on()
             self._glance()
@@ -138,8 +138,8 @@ class RigSession:
             return shot
 
     def take_plates(self) -> Plates:
-        """Takes clean plates of the empty studio and starts to use them. Raises ShotFailed, or PlatesRefused if they
-        show a person whom the old plates do not show; the old plates then stay in use."""
+        """Takes clean plates of the empty studio and starts to use them. Raises ShotFailed, or PlatesRefused if the new
+        plates show a person whom the old plates do not show; the old plates then stay in use."""
         with self._busy:
             self._trigger.switch_lamps_on()
             self._silent_until_s.clear()
@@ -167,7 +167,7 @@ class RigSession:
             return self.plates
 
     def _glance(self) -> None:
-        """Stores the picture of each camera before the release; if the same picture follows, the stream is frozen."""
+        """Stores each camera's picture before the release; if the shot shows the same picture, the stream is frozen."""
         now_s = time.monotonic()
         running = {name: s.period_s for name, feed in self._feeds.items() if (s := feed.state()).period_s is not None}
         for name in running:
@@ -181,10 +181,10 @@ class RigSession:
                 self._last_seen[name] = frame
 
     def _next_frames(self, deadline_s: float, only: Collection[str] | None = None) -> dict[str, Frame]:
-        """Returns the next frame of every camera. Cameras that wait for a trigger get one if they have no live view.
+        """Returns the next frame of every camera. Cameras that wait for a trigger and have no live view get a trigger.
 
-        A camera that sent nothing last time is not waited for during ``_SILENT_S``; a frame that arrives anyway is
-        used."""
+        After a camera has sent no frame, the method does not wait for this camera for ``_SILENT_S`` seconds, but uses a
+        frame that arrives."""
         now_s = time.monotonic()
         feeds = {name: feed for name, feed in self._feeds.items() if only is None or name in only}
         for feed in feeds.values():
@@ -207,7 +207,7 @@ class RigSession:
         return received
 
     def _release(self) -> _Release:
-        """Releases the shot and returns its time: the box's or, without a box in rig.toml, that of the command."""
+        """Releases the cameras and returns when: the trigger box's time or, without a box, the time of the command."""
         now_s = time.monotonic()
         for feed in self._feeds.values():
             feed.want(now_s)

@@ -64,7 +64,7 @@ class Fault:
 
     @property
     def is_error(self) -> bool:
-        """Returns whether the fault makes the capture fail. A fault that does not is a warning."""
+        """Returns whether the fault makes the capture fail. Any other fault is a warning."""
         return self.code not in WARNINGS
 
     @property
@@ -96,12 +96,12 @@ class Fault:
 
 
 def read_fault(document: Mapping[str, Any]) -> Fault:
-    """Reads a fault from the result of ``Fault.document``. Earlier versions stored the detail as a text."""
+    """Reads a fault from the result of ``Fault.document``. Earlier versions stored a fault's detail as a text."""
     return Fault(document["code"], document["camera"], read_message(document.get("detail_message", document["detail"])))
 
 
 class ShotFailed(EigenheadError):
-    """Reports a shot that is not usable as a capture. ``faults`` holds all its faults."""
+    """Reports a shot that is not usable as a capture. ``faults`` holds all faults of the shot."""
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self.faults = tuple(faults)
@@ -172,7 +172,7 @@ class SyncCertificate:
 
     @property
     def spread_s(self) -> float | None:
-        """Returns the time (s) from the earliest to the latest picture, or None if fewer than two arrived."""
+        """Returns the time (s) from the earliest to the latest picture, or None if fewer than two pictures arrived."""
         skews = [camera.skew_s for camera in self.cameras if camera.skew_s is not None]
         return max(skews) - min(skews) if len(skews) > 1 else None
 
@@ -250,8 +250,8 @@ class Shot:
 class Timing:
     """Holds the time (time.monotonic, s) at which one camera's frame was due, and the period of its live view (s).
 
-    If ``triggered``, an output of the trigger box starts the exposure; otherwise the next frame to arrive is used. If
-    ``recorded``, the picture comes from a recording, so its time is meaningless.
+    ``triggered``: whether an output of the trigger box starts the exposure, or else the next frame to arrive is used.
+    ``recorded``: whether the picture comes from a recording, so that its time is meaningless.
     """
 
     due_s: float

@@ -3,8 +3,8 @@
 A request is ``@SS BODY*CCCC\\n`` and its reply ``#SS BODY*CCCC\\n``. SS is a sequence number (two hex digits) and CCCC
 the CRC-16/CCITT-FALSE of ``SS BODY``. A receiver starts a new line at each start character, so noise between lines has
 no effect. The box ignores a damaged request, and the host sends the request again with the same sequence number. If the
-box has already executed a request of this number, it only repeats its reply. Requests and replies start with different
-characters, so that an echo is not mistaken for a reply.
+box has already executed a request with the same sequence number, it only repeats its reply. Requests and replies start
+with different characters, so that an echo is not mistaken for a reply.
 """
 
 import string
@@ -26,7 +26,7 @@ BUSY_S = 1.5  # longest release: delay and pulse take up to 0.5 s each, and the 
 
 
 class TriggerError(EigenheadError):
-    """Reports that the trigger box did not execute a request. All other errors of this module are subclasses."""
+    """Reports that the trigger box did not execute a request, and is the base class of this module's errors."""
 
 
 class TriggerUnplugged(TriggerError):
@@ -51,8 +51,8 @@ class WrongDevice(TriggerError):
 
 
 class TriggerRefused(TriggerError):
-    """Reports that the box understood a request and refused it. ``code`` is one of UNKNOWN,
-    ARGUMENT, NOT-ARMED, BUSY."""
+    """Reports that the trigger box understood a request and refused it. ``code`` is one of UNKNOWN, ARGUMENT,
+    NOT-ARMED, BUSY."""
 
     def __init__(self, body: str, code: Message | str) -> None:
         self.code = code
@@ -61,7 +61,7 @@ class TriggerRefused(TriggerError):
 
 @dataclass(frozen=True, slots=True)
 class BoxStatus:
-    """Holds the box's answer to STATUS. ``bad_lines`` is the number of damaged lines that the box ignored."""
+    """Holds the trigger box's answer to STATUS. ``bad_lines`` is the number of damaged lines that the box ignored."""
 
     state: str
     shots: int
@@ -71,7 +71,7 @@ class BoxStatus:
 
 @dataclass(frozen=True, slots=True)
 class BoxClock:
-    """Holds one comparison of clocks: the host's time (time.monotonic, s) at the box's time ``box_us``, and its
+    """Compares two clocks: holds the host's time (time.monotonic, s) at the trigger box's time ``box_us``, and its
     uncertainty (s)."""
 
     host_s: float
@@ -79,16 +79,16 @@ class BoxClock:
     uncertainty_s: float
 
     def host_from_box(self, box_us: int) -> float:
-        """Converts a box time (us) within 35 minutes of ``box_us`` to the host's time (time.monotonic, s). The box's
-        32-bit counter may overflow in between."""
+        """Converts a time of the trigger box (us), within 35 minutes of ``box_us``, to the host's time (time.monotonic,
+        s). Between the two times the box's 32-bit counter may overflow."""
         difference = (box_us - self.box_us + CLOCK_PERIOD_US // 2) % CLOCK_PERIOD_US - CLOCK_PERIOD_US // 2
         return self.host_s + difference * 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Fired:
-    """Holds one release of the cameras: when the box raised its outputs and when the host requested it (time.monotonic,
-    s), the uncertainty (s), and the box's count of shots."""
+    """Holds one release of the cameras: the times (time.monotonic, s) at which the trigger box raised its outputs and
+    the host requested this, the uncertainty (s), and the box's count of shots."""
 
     time_s: float
     uncertainty_s: float
@@ -97,7 +97,7 @@ class Fired:
 
 
 class TriggerBox:
-    """Controls one trigger box. A method returns after the box has acknowledged the request, or raises TriggerError.
+    """Controls one trigger box. Each method returns after the box has acknowledged a request, or raises TriggerError.
 
     ``port`` is a serial port or the pseudo-terminal of a simulated box. A path in /dev/serial/by-id does not change at
     a reboot. The constructor waits up to ``boot_s``, because many boards restart when their port is opened.
@@ -131,7 +131,7 @@ class TriggerBox:
         self.close()
 
     def close(self) -> None:
-        """Closes the serial port. The call may be repeated, and may follow an unplugged cable."""
+        """Closes the serial port. The method may be called repeatedly, and after the cable was unplugged."""
         # pyserial's close restores nothing that could fail, but an unplugged descriptor may still raise
         try:
             self._serial.close()
@@ -147,12 +147,12 @@ class TriggerBox:
         self._command(f"LIGHTS {mask:X}")
 
     def arm(self, window_s: float) -> None:
-        """Allows one call of ``fire`` within ``window_s``. After that time the box disarms itself."""
+        """Allows one call of ``fire`` within ``window_s`` seconds, after which the trigger box disarms itself."""
         self._command(f"ARM {round(window_s * 1000)}")
 
     def fire(self, mask: int, pulse_us: int) -> Fired:
-        """Raises the outputs whose bits are set in ``mask``, each after its delay, for ``pulse_us``. Needs an armed
-        box."""
+        """Raises the outputs whose bits are set in ``mask``, each after its delay, for ``pulse_us`` microseconds. Needs
+        an armed box."""
         clock = self._clock or self.synchronise()
         asked_s = time.monotonic()
         words = self._command(f"FIRE {mask:X} {pulse_us}")
@@ -168,10 +168,10 @@ class TriggerBox:
             raise WrongDevice(self.port, f"STATUS {fields}") from error
 
     def synchronise(self, rounds: int = 5) -> BoxClock:
-        """Compares the box's clock with time.monotonic ``rounds`` times. Returns the most precise comparison.
+        """Compares the box's clock with time.monotonic ``rounds`` times, and returns the most precise comparison.
 
-        By Cristian's method (Distributed Computing 3, 1989), the box read its clock at some time during a round trip.
-        The shortest round trip gives the narrowest bound; half its duration is the uncertainty.
+        By Cristian's method (Distributed Computing 3, 1989), the box reads its clock at some time during the round trip
+        of a request. The shortest round trip gives the narrowest bound; half its duration is the uncertainty.
         """
         best: BoxClock | None = None
         for _ in range(rounds):
@@ -191,7 +191,7 @@ class TriggerBox:
             raise WrongDevice(self.port, " ".join(words))
 
     def _command(self, body: str, attempts: int | None = None) -> list[str]:
-        """Repeats ``body`` until the box answers, even while it is busy. Returns the words of the reply after OK."""
+        """Repeats the request ``body`` until the trigger box answers, even if busy. Returns the words after OK."""
         until_s = time.monotonic() + BUSY_S
         while True:
             with self._lock:
@@ -235,7 +235,7 @@ class TriggerBox:
 
 
 class RigTrigger:
-    """Holds the trigger box that rig.toml names. After an error it is closed, and the next use opens it again.
+    """Holds the trigger box that rig.toml names. An error closes the trigger box, and its next use opens it.
 
     ``error``: why it cannot be used; None if it can, or if rig.toml names none."""
 
@@ -258,7 +258,7 @@ class RigTrigger:
         self._box = None
 
     def open(self) -> None:
-        """Opens the box and sets the delays of the cameras, unless it is open."""
+        """Opens the trigger box and sets the delays of the cameras, unless the box is open."""
         trigger = self._config.trigger
         if trigger is None or self._box is not None:
             return
@@ -270,14 +270,14 @@ class RigTrigger:
             self.error = None
 
     def close(self) -> None:
-        """Switches the lamps off, unless rig.toml keeps them on, and closes the box. Safe to call twice."""
+        """Switches the lamps off, unless rig.toml keeps them on, and closes the trigger box. Safe to call twice."""
         with self._attempt():
             if self._box is not None and not self._config.lights.keep_on:
                 self._box.set_lights(0)
         self._drop()
 
     def switch_lamps_on(self) -> None:
-        """Opens the box, switches the lamps of rig.toml on and waits until they are steady."""
+        """Opens the trigger box, switches the lamps of rig.toml on and waits until they are steady."""
         self.open()
         lights = self._config.lights
         mask = sum(1 << output for output in lights.outputs)
@@ -287,7 +287,7 @@ class RigTrigger:
                 time.sleep(lights.settle_s)
 
     def fire(self) -> Fired | None:
-        """Releases the cameras that wait for the box. Returns None if there is none or if it fails."""
+        """Releases the cameras that wait for the trigger box. Returns None if the rig has no box or the box fails."""
         trigger, cameras = self._config.trigger, self._config.cameras
         mask = sum(1 << c.channel for c in cameras if c.trigger == "external" and c.channel is not None)
         with self._attempt():

@@ -1,6 +1,6 @@
-"""Judges whether a capture is worth reconstructing, for shots while the subject is still present and for uploads.
+"""Judges whether a capture, taken by the rig or uploaded, is worth reconstructing.
 
-Only one camera's picture is in memory at a time."""
+The module holds only one camera's picture in memory at a time."""
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -70,8 +70,8 @@ class ViewCheck:
 def check_view(
     image: ImageRgb, plate: ImageRgb | None, mask: Bool[np.ndarray, "h w"] | None, *, place_only: bool = False
 ) -> ViewCheck:
-    """Measures one camera's picture and finds the subject in it. ``place_only`` only searches the subject, if the shot
-    was measured before."""
+    """Measures one camera's picture and finds the subject in it. With ``place_only`` the function only finds the
+    subject, because the picture was already measured."""
     if mask is not None and mask.shape == image.shape[:2]:
         position = subject_of_mask(mask)
     else:
@@ -99,7 +99,7 @@ def without_consequences(faults: Iterable[Fault]) -> list[Fault]:
 
 def verdict_of(faults: Iterable[Fault], cameras: Collection[str]) -> Verdict:
     """Returns the verdict on a capture. The verdict is ``good`` without faults, and ``poor`` if the whole rig has a
-    fault or too few ``cameras`` are free of faults. Otherwise the verdict is ``usable``."""
+    fault or too few ``cameras`` are free of faults. Any other capture has the verdict ``usable``."""
     named = {fault.camera for fault in faults}
     if not named:
         return "good"

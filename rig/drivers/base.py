@@ -1,5 +1,5 @@
 """Defines the interface and the errors of camera drivers, and creates the driver that rig.toml names for a camera. A
-driver's module, with its vendor's library, is imported only if rig.toml names it.
+driver's module, with its vendor's library, is imported only if rig.toml names this driver.
 
 ``grab`` waits for the camera's next frame and returns its time of arrival; ``retrieve`` decodes the frame. The two
 calls are separate because most frames are never used, and decoding every frame would delay the measured times. Only one
@@ -55,8 +55,8 @@ class Driver(Protocol):
         ...
 
     def grab(self, timeout_s: float) -> Arrival:
-        """Waits for the next frame and returns its time of arrival. Raises GrabTimeout, after which ``grab`` may be
-        called again, and CameraLost.
+        """Waits for the next frame and returns its time of arrival. Raises CameraLost for a lost camera, and
+        GrabTimeout, after which ``grab`` may be called again.
 
         The call may take a second longer than ``timeout_s`` if the vendor's library has no timeout.
         """
@@ -67,7 +67,7 @@ class Driver(Protocol):
         ...
 
     def trigger(self) -> None:
-        """Makes the camera take a picture if its ``trigger`` in rig.toml is "software"; otherwise does nothing."""
+        """Makes the camera take a picture, but only if its ``trigger`` in rig.toml is "software"."""
         return
 
     def close(self) -> None:
@@ -98,7 +98,7 @@ class CameraLost(DriverError):
 
 
 class GrabTimeout(DriverError):
-    """Reports that no frame arrived in time. The camera may still work."""
+    """Reports that no frame arrived in time, from a camera that may still work."""
 
     def __init__(self, camera: CameraConfig, timeout_s: float) -> None:
         super().__init__(camera.name, compose("no-frame-within", seconds=timeout_s))
@@ -129,7 +129,7 @@ def driver_for(camera: CameraConfig, folder: Path) -> Driver:
 
 
 class Pace:
-    """Ticks ``fps`` times a second. A tick that no call waits for is lost, as are a camera's frames."""
+    """Ticks ``fps`` times a second. A tick for which no call of ``wait`` waits is lost, like a camera's frame."""
 
     def __init__(self, fps: float) -> None:
         self._period_s = 1.0 / fps
@@ -137,7 +137,7 @@ class Pace:
         self.beat = 0
 
     def wait(self, timeout_s: float) -> bool:
-        """Sleeps until the next tick, or for ``timeout_s`` at most. Returns whether a tick came."""
+        """Sleeps until the next tick, or for ``timeout_s`` at most. Returns whether a tick occurred."""
         passed = int((time.monotonic() - self._started_s) / self._period_s)
         due = max(self.beat + 1, passed)
         wait_s = self._started_s + due * self._period_s - time.monotonic()

@@ -1,7 +1,7 @@
 """Runs each camera in a thread that opens it, grabs frames continuously, and decodes requested frames.
 
 A driver may block forever inside a vendor's library. Therefore every camera has a separate thread, and every wait has a
-deadline. If a daemon thread does not end, the program reports this and continues without it.
+deadline. If a camera's daemon thread does not end, the program reports this and continues without the thread.
 """
 
 import contextlib
@@ -24,8 +24,8 @@ _KEPT = 32  # frames that wait to be collected: half a second at 60 a second
 
 @dataclass(frozen=True, slots=True)
 class FeedState:
-    """Holds the current state of one camera. Times are in seconds of time.monotonic. ``unmet`` lists the settings that
-    the camera refused."""
+    """Holds the current state of one camera. The state's times are in seconds of time.monotonic. ``unmet`` lists the
+    settings that the camera refused."""
 
     opened: bool
     last_seen_s: float | None
@@ -35,7 +35,7 @@ class FeedState:
 
 
 class CameraFeed:
-    """Runs one camera's driver in a thread. Methods that wait have a deadline, in seconds of time.monotonic."""
+    """Runs one camera's driver in a thread. Each method that waits has a deadline, in seconds of time.monotonic."""
 
     def __init__(self, camera: CameraConfig, driver: Driver, open_timeout_s: float) -> None:
         self.camera = camera
@@ -64,7 +64,7 @@ class CameraFeed:
         self._stop.set()
 
     def close(self, deadline_s: float) -> bool:
-        """Ends the thread. Returns False if the driver still blocks the thread at the deadline."""
+        """Ends the camera's thread. Returns False if the driver still blocks the thread at the deadline."""
         self.stop()
         if self._thread.ident is not None:
             self._thread.join(max(0.0, deadline_s - time.monotonic()))
@@ -89,21 +89,21 @@ class CameraFeed:
             return self._opened
 
     def wait_frames(self, count: int, deadline_s: float) -> bool:
-        """Waits until the camera has delivered ``count`` frames since it was opened. Returns False at the deadline."""
+        """Waits until the camera has delivered ``count`` frames since it was opened; returns False at the deadline."""
         with self._changed:
             self._changed.wait_for(lambda: self._count >= count, _left(deadline_s))
             return self._count >= count
 
     def want(self, from_s: float) -> None:
         """Starts to decode and store the frames that arrive after ``from_s`` (time.monotonic, s), until ``collect``
-        takes one."""
+        takes a frame."""
         with self._changed:
             self._frames.clear()
             self._wanted_from_s, self._due_s = from_s, None
 
     def due(self, earliest_s: float) -> None:
-        """Requests only the first frame that arrives at ``earliest_s`` (time.monotonic, s) or later. Later frames are
-        not decoded."""
+        """Requests only the first frame that arrives at ``earliest_s`` (time.monotonic, s) or later. Frames after that
+        first one are not decoded."""
         with self._changed:
             self._due_s = earliest_s
 

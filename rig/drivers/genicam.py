@@ -1,11 +1,11 @@
 """Controls GigE Vision and USB3 Vision cameras through the library Aravis (Debian package libaravis-0.8-0).
 
 In rig.toml, ``identity`` is the serial number, or the device's id or MAC address as `arv-tool-0.8` lists them. With
-``trigger = "external"`` the camera waits for a signal on its input Line1, with ``"software"`` for a command. With
-``"free"`` the camera takes ``fps`` pictures a second.
+``trigger = "external"`` the camera waits for a signal on its input Line1, with ``trigger = "software"`` for a command.
+With ``trigger = "free"`` the camera takes ``fps`` pictures a second.
 
-The module calls the library through ctypes, because PyGObject would have to be compiled in every virtual environment.
-The functions' signatures are from https://aravisproject.github.io/aravis/aravis-stable/.
+The module calls Aravis through ctypes, because PyGObject would have to be compiled in every virtual environment. The
+signatures of Aravis' functions are from https://aravisproject.github.io/aravis/aravis-stable/.
 """
 
 import contextlib
@@ -95,7 +95,7 @@ _MAY_FAIL: dict[str, tuple[Any, list[Any]]] = {
 
 
 class Aravis:
-    """Wraps the library libaravis. ``call`` runs one of its functions and converts a GError to AravisError."""
+    """Wraps the library libaravis. ``call`` runs a function of libaravis and converts a GError to AravisError."""
 
     def __init__(self) -> None:
         self._aravis = ctypes.CDLL(LIBRARY)
@@ -125,7 +125,7 @@ class Aravis:
         return result
 
     def release(self, pointer: int) -> None:
-        """Releases a reference to a GObject."""
+        """Releases the reference ``pointer`` to a GObject."""
         self._gobject.g_object_unref(pointer)
 
     def pixels(self, buffer: int) -> UInt8[np.ndarray, " n"]:
@@ -137,7 +137,7 @@ class Aravis:
 
 @cache
 def library() -> Aravis:
-    """Returns the library, which the first call loads. Raises OSError if libaravis is not installed."""
+    """Returns the library libaravis, which the first call loads. Raises OSError if libaravis is not installed."""
     return Aravis()
 
 
@@ -198,8 +198,8 @@ class GenicamDriver:
         raise GrabTimeout(self._camera, timeout_s)
 
     def retrieve(self) -> ImageRgb:
-        """Decodes the frame of the last ``grab``. Raises CameraLost without a frame, and DriverError for an unknown
-        pixel format."""
+        """Decodes the frame of the last ``grab``. Raises CameraLost if there is no frame, and DriverError for an
+        unknown pixel format."""
         if self._buffer is None:
             raise CameraLost(self._camera, compose("no-frame-grabbed"))
         width = self._aravis.call("arv_buffer_get_image_width", self._buffer)

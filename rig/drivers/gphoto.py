@@ -1,8 +1,8 @@
 """Controls DSLRs and other PTP cameras through python-gphoto2 (optional dependency group ``gphoto``).
 
 In rig.toml, ``identity`` is the camera's serial number, or a network address such as ``ptpip:192.168.1.7``. The trigger
-box releases the shutter by a cable (``trigger = "external"``), or the host by a command (``"software"``). The camera
-must be set to JPEG; its memory card is not used.
+box releases the shutter by a cable (``trigger = "external"``), or the host releases it by a command (``trigger =
+"software"``). The camera must be set to JPEG; its memory card is not used.
 """
 
 import importlib
@@ -56,8 +56,8 @@ class GphotoDriver:
             raise CameraNotFound(self._camera, str(error)) from error
 
     def configure(self) -> tuple[Message, ...]:
-        """Applies the settings of rig.toml. Returns one message for each setting that the camera refused; gain cannot
-        be set."""
+        """Applies the settings of rig.toml. Returns one message for each setting that the camera refused, which always
+        includes a gain."""
         camera = self._camera
         wanted: list[tuple[str, str, Any]] = [("capturetarget", "capturetarget", "Internal RAM")]
         if camera.pixel_format is not None:
@@ -88,8 +88,8 @@ class GphotoDriver:
         raise GrabTimeout(self._camera, timeout_s)
 
     def retrieve(self) -> ImageRgb:
-        """Downloads and decodes the picture of the last ``grab``. Raises CameraLost, and DriverError for a damaged
-        file."""
+        """Downloads and decodes the picture of the last ``grab``. Raises CameraLost for a lost camera, and DriverError
+        for a damaged file."""
         if self._file is None:
             raise CameraLost(self._camera, compose("no-picture-grabbed"))
         try:
@@ -161,8 +161,8 @@ class GphotoDriver:
         return device
 
     def _set(self, name: str, value: Any) -> bool:
-        """Sets one configuration value, a number to the nearest available choice. Returns whether the camera accepted
-        it."""
+        """Sets one configuration value of the camera; a number is set to the nearest available choice. Returns whether
+        the camera accepted the value."""
         try:
             widget = self._opened().get_single_config(name)
             choices = list(widget.get_choices()) if widget.get_type() == self._gp.GP_WIDGET_RADIO else []
@@ -177,7 +177,7 @@ class GphotoDriver:
 
 
 def _serial_of(camera: CameraConfig) -> str:
-    """Returns the serial number without leading zeros, because the number printed on the body lacks them."""
+    """Returns the serial number without leading zeros, because the number printed on the camera lacks these zeros."""
     return camera.identity.lstrip("0")
 
 

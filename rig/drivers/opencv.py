@@ -1,11 +1,11 @@
 """Controls cameras through OpenCV (UVC and other V4L2 cameras, RTSP), and reads motion JPEG over HTTP.
 
-V4L2 puts a time stamp of CLOCK_MONOTONIC on each buffer. The driver uses plausible stamps, because time.monotonic is
-the same clock.
+V4L2 puts a time stamp of CLOCK_MONOTONIC on each buffer. The driver uses plausible V4L2 time stamps as times of
+arrival, because time.monotonic is the same clock.
 
-A motion JPEG stream is a multipart/x-mixed-replace body (RFC 2046, section 5.1). OpenCV's reader would decode every
-frame before it reports the frame. This module decodes only requested frames. A frame's time of arrival is the time at
-which the kernel received the frame's header.
+A motion JPEG stream is a multipart/x-mixed-replace body (RFC 2046, section 5.1). This module decodes only requested
+frames; OpenCV's reader would decode every frame before reporting it. A frame's time of arrival is the time at which the
+kernel received the frame's header.
 """
 
 import base64
@@ -41,7 +41,7 @@ _STREAM_STALE_S = 5.0  # a kernel stamp of a packet further from now than this i
 
 
 class StreamTimeout(Exception):
-    """Reports that no data arrived in time. Reading may continue."""
+    """Reports that a stream delivered no data in time. Reading may continue."""
 
 
 class StreamBroken(Exception):
@@ -69,7 +69,7 @@ class MjpegStream:
             raise
 
     def close(self) -> None:
-        """Ends the connection. The call may be repeated."""
+        """Ends the connection; the method may be called repeatedly."""
         self._socket.close()
 
     def next_part(self, timeout_s: float) -> tuple[float, bytes]:
@@ -238,7 +238,7 @@ class MjpegDriver(Driver):
         return Arrival(time_s, self._sequence)
 
     def retrieve(self) -> ImageRgb:
-        """Decodes the JPEG file of the last ``grab``. Raises DriverError if it is damaged."""
+        """Decodes the JPEG file of the last ``grab``. Raises DriverError if the file is damaged."""
         return decode_jpeg(self._camera, self._jpeg)
 
     def close(self) -> None:
@@ -301,7 +301,7 @@ class VideoCaptureDriver(Driver):
         return Arrival(self._stamp_s(capture), self._sequence)
 
     def retrieve(self) -> ImageRgb:
-        """Decodes the frame of the last ``grab``. Raises DriverError if that fails."""
+        """Decodes the frame of the last ``grab``. Raises DriverError if the frame cannot be decoded."""
         done, image = self._opened().retrieve()
         if not done or image is None:
             raise DriverError(self._camera.name, compose("frame-not-decoded"))
@@ -359,7 +359,7 @@ def decode_jpeg(camera: CameraConfig, data: bytes) -> ImageRgb:
 
 
 def _is_taken(prop: int, wanted: float, actual: float) -> bool:
-    """Returns whether a value was set: a pixel format exactly, another value within 5 %, because cameras have steps."""
+    """Returns whether a camera took a value: a pixel format exactly, others within 5 %, because cameras have steps."""
     return abs(actual - wanted) <= (0.0 if prop == cv2.CAP_PROP_FOURCC else _NEAR * abs(wanted))
 
 

@@ -1,8 +1,8 @@
 """Replaces a camera by one picture from a recorded capture, delivered repeatedly at a fixed rate.
 
 In rig.toml, ``identity`` is the capture's folder, relative to rig.toml. If the camera has another name in the capture,
-``#`` and that name follow. The setting ``plates = "FOLDER/background"`` adds the recorded clean plates (pictures of the
-empty studio).
+``identity`` continues with ``#`` and that name. The setting ``plates = "FOLDER/background"`` adds the recorded clean
+plates (pictures of the empty studio).
 """
 
 from pathlib import Path

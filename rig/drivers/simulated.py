@@ -1,8 +1,8 @@
 """Simulates a camera of a studio inside this process, without network or trigger box.
 
-In rig.toml, ``identity`` is the mesh file of a head, relative to rig.toml. If the studio's camera has another name,
-``#`` and that name follow. The camera renders the head in the default studio at its frame rate.
-``rig.studio.devices.serve`` instead simulates separate network cameras and a trigger box.
+In rig.toml, ``identity`` is the mesh file of a head, relative to rig.toml. If the camera has another name in the
+studio, ``identity`` continues with ``#`` and that name. The simulated camera renders the head in the default studio at
+the camera's frame rate. ``rig.studio.devices.serve`` instead simulates separate network cameras and a trigger box.
 """
 
 import time
@@ -49,7 +49,7 @@ class SimulatedDriver(PacedDriver):
         return tuple(compose("no-setting-of-simulated", setting=key) for key in self._camera.exposure_settings())
 
     def retrieve(self) -> ImageRgb:
-        """Renders and returns the camera's current view. Raises CameraLost if it is not open."""
+        """Renders and returns the camera's current view. Raises CameraLost if the camera is not open."""
         if self._source is None or self._pace is None:
             raise CameraLost(self._camera, compose("camera-not-open"))
         return self._source(self._view, time.monotonic())

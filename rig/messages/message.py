@@ -1,12 +1,12 @@
 """Defines the one type for everything that the program reports: warnings, faults, refusals, failures.
 
-A code is stable; its template (``rig/messages/english``) may be reworded at any time: ``{name}`` is replaced by a
-parameter, ``{name:.1f}`` by a number, "one | several" are the forms for a count. Format specifications are those of
-Python that the console's ``messages.js`` also supports (``SPECIFICATIONS``). ``word`` marks a value that is translated,
-such as the state of a job; names are not translated.
+A message's code is stable; its template (``rig/messages/english``) may be reworded at any time. In a template
+``{name}`` is replaced by a parameter, ``{name:.1f}`` by a number; "one | several" are the forms for a count. Templates
+use only those of Python's format specifications that the console's ``messages.js`` also supports (``SPECIFICATIONS``).
+The specification ``word`` marks a value that is translated, such as the state of a job; names are not translated.
 
-A new message needs: its code and template in a module of ``rig/messages/english``, its German in
-``server/console/static/messages_de.js``, and ``compose(code, ...)`` where it is used. Tests check that the three agree.
+A new message needs, as tests check: its code and template in a module of ``rig/messages/english``, its German in
+``server/console/static/messages_de.js``, and ``compose(code, ...)`` where it is used.
 """
 
 import math
@@ -29,20 +29,20 @@ FORMS = " | "
 
 
 def fields_of(template: str) -> dict[str, str]:
-    """Returns the format specification of every field: "" without one; ``count`` if the template has forms."""
+    """Returns the format specification (or "") of every field of a template, and of ``count`` if it has two forms."""
     fields = {name: specification or "" for name, specification in FIELD.findall(template)}
     return {"count": "", **fields} if FORMS in template else fields
 
 
 def render(template: str, parameters: Mapping[str, Any]) -> str:
-    """Fills in a template. Raises KeyError for a field without a parameter."""
+    """Fills in a template. Raises KeyError if a field of the template has no parameter."""
     forms = template.split(FORMS)
     form = forms[0] if len(forms) == 1 or parameters["count"] == 1 else forms[-1]
     return FIELD.sub(lambda field: _written(parameters[field[1]], field[2] or ""), form)
 
 
 def _written(value: object, specification: str) -> str:
-    """Formats a value; lists get commas between names and semicolons between sentences."""
+    """Formats a value as text; a list gets commas between names and semicolons between sentences."""
     if isinstance(value, tuple):
         between = ", " if all(isinstance(item, str | int | float) for item in value) else "; "
         return between.join(_written(item, specification) for item in value)
@@ -71,8 +71,8 @@ VERBATIM = "verbatim"  # the code of text that another program or an earlier ver
 
 @runtime_checkable
 class Scalar(Protocol):
-    """Describes a number of NumPy. NumPy itself is not imported here, so that a command that only prints a message
-    starts at once."""
+    """Describes a number of NumPy. The module does not import NumPy itself, so that a command that only prints a
+    message starts at once."""
 
     @property
     def dtype(self) -> Any:
@@ -85,7 +85,7 @@ class Scalar(Protocol):
 
 
 class MessageDocument(TypedDict):
-    """Holds a message in JSON. Those of earlier versions have no parameters."""
+    """Holds a message in JSON. Messages stored by earlier versions of the program have no parameters."""
 
     code: str
     message: str
@@ -114,15 +114,15 @@ class Message:
 
 
 def compose(code: str, /, **parameters: Raw) -> Message:
-    """Makes the message of a code. Its parameters must be exactly those in the template. Other parameters, or an
-    unknown code, are programming errors (AssertionError, KeyError)."""
+    """Makes the message of a code, with exactly the parameters in the code's template. Raises KeyError for an unknown
+    code, and AssertionError for other parameters, because these are programming errors."""
     template, values = CATALOGUE[code], {name: _parameter(value) for name, value in parameters.items()}
     assert values.keys() == fields_of(template).keys(), f"{code}: {sorted(values)} for {template!r}"
     return Message(code, values, render(template, values))
 
 
 def verbatim(text: str) -> Message:
-    """Makes a message from a text without a code: another program's, or an earlier version's."""
+    """Makes a message without a code from a text, which another program or an earlier version wrote."""
     return Message(VERBATIM, {"text": text}, text)
 
 
@@ -133,7 +133,7 @@ def message_of(message: Message | str) -> Message:
 
 def read_message(document: object) -> Message:
     """Reads the output of ``Message.document``, and the texts and ``{code, message}`` of earlier versions. Raises
-    ValueError for anything else."""
+    ValueError for any other document."""
     if isinstance(document, str):
         return verbatim(document)
     if not isinstance(document, Mapping) or not all(isinstance(document.get(key), str) for key in ("code", "message")):
@@ -179,7 +179,7 @@ def _read(value: Any) -> Parameter:
 
 def say_once(faults: Sequence[Message | str], names: Iterable[str], *, named_most: int = NAMED_MOST) -> list[Message]:
     """Groups faults that differ only in the names of cameras and files, and in the values measured for each. Each group
-    becomes one message that names the first and counts the others."""
+    of faults becomes one message that names the first cameras or files and counts the others."""
     ordered = sorted(set(names), key=len, reverse=True)
     name = re.compile(r"(?<![^\W_])(" + "|".join(map(re.escape, ordered)) + r")(?![^\W_])") if ordered else None
     plate = re.compile(r"\b(background/)\S+")

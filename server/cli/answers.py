@@ -31,14 +31,14 @@ LINE_S = 30.0  # between lines of progress in a log
 
 
 class CannotWrite(EigenheadError):
-    """Reports an output path that cannot be written. It is raised before the work begins."""
+    """Reports an output path that cannot be written. The error is raised before the work begins."""
 
     def __init__(self, path: Path, error: OSError, option: str = "--out") -> None:
         super().__init__(f"{path} cannot be written ({error.strerror or error}); name another place with {option}")
 
 
 class SpoilsCapture(EigenheadError):
-    """Reports an output path within the capture, because the next run would read the result as input."""
+    """Reports an output path within the capture, because the next reconstruction would read the result as input."""
 
     def __init__(self, path: Path, option: str = "--out") -> None:
         super().__init__(f"{path} lies where the capture's own pictures do; name another place with {option}")
@@ -113,7 +113,7 @@ def service_settings(**overrides: Any) -> Any:
 
 
 def _setting_fault(fault: Any, options: Mapping[str, object]) -> str:
-    """Words a fault that pydantic found, naming the option or the environment variable that holds the wrong value."""
+    """Returns a sentence on a fault found by pydantic, naming the option or variable with the wrong value."""
     from server.settings import PREFIX
 
     field, *inner = map(str, fault["loc"])
@@ -122,7 +122,7 @@ def _setting_fault(fault: Any, options: Mapping[str, object]) -> str:
 
 
 def completing(choices: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Returns a function for completion by the shell: it lists the choices that begin with what was typed."""
+    """Returns a function for completion by the shell, which lists the choices that begin with what was typed."""
     # The parameter's name tells typer what to pass.
     return lambda incomplete: [choice for choice in choices() if choice.startswith(incomplete)]
 
@@ -156,9 +156,9 @@ def wrong_usage(option: str) -> Iterator[None]:
 
 
 def prepare_file(path: Path, *, overwrite: bool = True, option: str = "--out") -> None:
-    """Makes the folder of an output file and checks that it can be written, before any work is done for it.
+    """Makes the folder of an output file and checks, before any other work, that the file can be written.
 
-    Raises CannotWrite, and Overwrites if the file exists and ``overwrite`` is false."""
+    Raises CannotWrite for an unwritable path, and Overwrites if the file exists and ``overwrite`` is false."""
     if path.exists() and not overwrite:
         raise Overwrites(path, "place" if option == "--out" else option)
     try:
@@ -172,8 +172,8 @@ def prepare_file(path: Path, *, overwrite: bool = True, option: str = "--out") -
 
 
 def prepare_folder(path: Path, sign: str = "", *, overwrite: bool = True) -> None:
-    """Makes an output folder and checks that it can be written. Raises CannotWrite, and Overwrites if the folder has
-    the file ``sign`` and ``overwrite`` is false."""
+    """Makes an output folder. Raises CannotWrite if the folder cannot be written, and Overwrites if the folder has the
+    file ``sign`` and ``overwrite`` is false."""
     if sign and (path / sign).exists() and not overwrite:
         raise Overwrites(path / sign)
     try:
@@ -187,7 +187,7 @@ def prepare_folder(path: Path, sign: str = "", *, overwrite: bool = True) -> Non
 
 
 def _make_folder(path: Path) -> None:
-    """Makes a folder, and removes it at the end if it is still empty because the command was refused."""
+    """Makes a folder, and removes it at the end of the command if the folder is still empty."""
     atexit.register(_remove_empty, [folder for folder in (path, *path.parents) if not folder.exists()])
     path.mkdir(parents=True, exist_ok=True)
 
@@ -200,7 +200,7 @@ def _remove_empty(folders: Iterable[Path]) -> None:
 
 @contextmanager
 def terminated_like_interrupted() -> Iterator[None]:
-    """Makes SIGTERM end the block as Ctrl-C does, so nothing unfinished remains. Job schedulers send SIGTERM some
+    """Makes SIGTERM end the block as Ctrl-C does, so that no unfinished file remains. Job schedulers send SIGTERM some
     seconds before SIGKILL."""
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -217,7 +217,7 @@ def terminated_like_interrupted() -> Iterator[None]:
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
     """Yields a function that shows progress (stage, fraction 0 to 1) as a bar on standard error. If standard error is
-    no terminal, it writes a line every ``LINE_S``."""
+    no terminal, the function writes a line every ``LINE_S`` seconds."""
     if QUIET.is_set() or not sys.stderr.isatty():
         yield _line_writer()
         return
@@ -248,7 +248,7 @@ def answer(document: Any, as_json: bool, lines: list[str]) -> None:
 
 
 def warn(message: str) -> None:
-    """Prints a warning on standard error, unless ``--quiet`` was given; the command goes on."""
+    """Prints a warning on standard error, unless ``--quiet`` was given, and lets the command continue."""
     if not QUIET.is_set():
         print(f"eigenhead: {message}", file=sys.stderr)
 

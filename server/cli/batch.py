@@ -1,6 +1,6 @@
-"""Implements ``eigenhead batch``: reconstructs many captures, one result folder each, and makes a table of all.
+"""Implements ``eigenhead batch``: reconstructs many captures, each into its own folder, and makes a table of all heads.
 
-Progress is a bar on a terminal, otherwise one line for each capture, for a scheduler's log."""
+Progress is shown as a bar on a terminal, or else (in a scheduler's log) as one line for each capture."""
 
 import os
 import sys
@@ -39,7 +39,7 @@ NAMED_MOST = 10  # failed captures that the last line names; the table lists all
 
 
 class CapturesFailed(EigenheadError):
-    """Reports at the end of a batch that some captures failed; the results of the others are complete."""
+    """Reports at the end of a batch that some captures failed; the results of the other captures are complete."""
 
     def __init__(self, failed: Sequence[str], count: int) -> None:
         names = [*failed[:NAMED_MOST], *(["..."] if len(failed) > NAMED_MOST else [])]
@@ -183,8 +183,8 @@ Clock = Callable[[], float]
 
 
 class BatchProgress:
-    """Counts finished captures; ``workers`` of them run at once. The remaining time is estimated from their mean
-    duration, and from ``expected_s`` until the first is done. ``clock`` returns monotonic seconds."""
+    """Counts finished captures of a batch, of which ``workers`` run at once. The remaining time is estimated from the
+    captures' mean duration or, until the first is done, from ``expected_s``. ``clock`` returns monotonic seconds."""
 
     def __init__(self, captures: int, workers: int, expected_s: float, clock: Clock = time.monotonic) -> None:
         self._captures, self._workers, self._expected_s, self._clock = captures, workers, expected_s, clock
@@ -193,7 +193,7 @@ class BatchProgress:
         self.ended = self.failed = 0
 
     def report(self, name: str, share: float) -> None:
-        """Records the done fraction of a capture, 0 to 1; 0 means that its work begins."""
+        """Records the fraction of a capture's work that is done, from 0 (the work begins) to 1."""
         since, _ = self._running.get(name, (self._clock(), 0.0))
         self._running[name] = since, min(1.0, max(0.0, share))
 
@@ -227,8 +227,8 @@ def told_time(seconds: float) -> str:
 
 
 class BatchDisplay:
-    """Shows the events of a batch run, as its ``Observer``. ``bar`` is rich's progress bar, or None if standard error
-    is no terminal."""
+    """Shows the events of a batch run, as its ``Observer``. ``bar`` is a progress bar of the library rich, or None if
+    standard error is no terminal."""
 
     def __init__(self, workers: int, expected_s: float, bar: Any = None) -> None:
         self._workers, self._expected_s, self._bar = workers, expected_s, bar
@@ -273,7 +273,7 @@ class BatchDisplay:
         self._show()
 
     def end(self, outcome: "Outcome") -> None:
-        """Shows how a capture ended, and why if it failed."""
+        """Shows how the work on a capture ended and, if it failed, why."""
         self._progress.end(outcome.name, failed=outcome.state == "failed")
         self._show()
         if outcome.failure is not None:

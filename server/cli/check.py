@@ -2,7 +2,7 @@
 
 Files, cameras, clean plates and feature points are checked as the service checks an upload (``server.tasks.ingest``):
 if these checks find no fault, the outlines are extracted and used to check pictures and cameras. A fault of this
-machine, unlike a fault of the capture, is raised as an error."""
+machine is raised as an error; a fault of the capture is not."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,8 +24,8 @@ from server.tasks.reconstruct import folder_of
 
 
 def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> dict[str, Any]:
-    """Returns what `eigenhead check --json` prints: the ``faults`` of a capture folder or archive that make a
-    reconstruction fail, its ``warnings``, and in English what one does with photographs alone (``will``).
+    """Returns what `eigenhead check --json` prints: the ``faults`` that make a reconstruction of the capture fail, its
+    ``warnings``, and for photographs without cameras sentences on what a reconstruction will do (``will``).
 
     Raises InputError for wrong settings, and WrongVariable or WorkFailed if this machine, not the capture, is at fault.
     """
@@ -66,7 +66,7 @@ def _check_front(front: str | None, cameras: list[str]) -> None:
 def _plan_for_photographs(folder: Path, report: Progress) -> tuple[list[str], list[str]]:
     """Returns the names of the photographs of a folder without cameras, and sentences on what a reconstruction will do.
 
-    Raises InputError for photographs, or a scale.json, that cannot be used."""
+    Raises InputError if the photographs or scale.json cannot be used."""
     from calibration.scene.photographs import find_photographs
     from rig.formats.cameras.scale_json import read_scale
 
@@ -88,7 +88,7 @@ def _plan_for_photographs(folder: Path, report: Progress) -> tuple[list[str], li
 
 
 def _check_pictures(files: list[Path], root: Path, report: Progress) -> None:
-    """Decodes the pictures one after the other. Raises InputError naming every picture that is damaged or too large."""
+    """Decodes the pictures one by one, and raises InputError naming every picture that is damaged or too large."""
     faults = []
     for number, path in enumerate(files):
         report("check", number / len(files))

@@ -32,8 +32,8 @@ RETRY_STATUSES = (429, 502, 503, 504)
 
 
 class ServiceError(EigenheadError):
-    """Reports a request that the service refused. ``status``, ``kind`` and ``errors`` are those of its problem
-    document."""
+    """Reports a request that the service refused. ``status``, ``kind`` and ``errors`` are fields of the problem
+    document with which the service answered."""
 
     def __init__(self, status: int, kind: str, detail: str, errors: list[str]) -> None:
         super().__init__(detail + "".join(f"\n  - {error}" for error in errors))
@@ -41,7 +41,7 @@ class ServiceError(EigenheadError):
 
 
 class Unreachable(EigenheadError):
-    """Reports a service that could not be reached within the client's patience."""
+    """Reports a service that could not be reached within the seconds that the client waits."""
 
     def __init__(self, url: str, error: Exception) -> None:
         why = str(error) or type(error).__name__
@@ -49,7 +49,7 @@ class Unreachable(EigenheadError):
 
 
 class JobEnded(EigenheadError):
-    """Reports a job that failed or was cancelled; ``job`` is its document."""
+    """Reports a job that failed or was cancelled; ``job`` is the job's JSON document."""
 
     def __init__(self, job: "JsonObject") -> None:
         error = job.get("error")
@@ -61,7 +61,7 @@ class JobEnded(EigenheadError):
 
 class Client:
     """Calls one service. If a connection breaks or the service is busy, a request is repeated for ``patience_s``
-    seconds. A refused request is not repeated."""
+    seconds. A request that the service refuses is not repeated."""
 
     def __init__(self, url: str, key: str | None = None, *, patience_s: float = 30.0, timeout_s: float = 300.0) -> None:
         headers = {"Authorization": f"Bearer {key}"} if key else {}
@@ -83,8 +83,8 @@ class Client:
     def post(self, path: str, document: Any = None, headers: dict[str, str] | None = None) -> Any:
         """Sends a POST of ``document`` and returns the JSON of the answer. Raises ServiceError and Unreachable.
 
-        After a broken connection the client cannot know whether the service acted, so it repeats the request only if
-        ``headers`` has an Idempotency-Key.
+        After a broken connection the client repeats the request only if ``headers`` has an Idempotency-Key, since the
+        service may have acted.
         """
         again = bool(headers and "Idempotency-Key" in headers)
         return self._request("POST", path, json=document, headers=headers, repeat=again).json()
@@ -94,7 +94,7 @@ class Client:
         return self._request("PUT", path, json=document).json()
 
     def delete(self, path: str) -> None:
-        """Sends a DELETE. Raises ServiceError if the service refuses it, and Unreachable."""
+        """Sends a DELETE. Raises ServiceError if the service refuses the request, and Unreachable without an answer."""
         self._request("DELETE", path)
 
     def upload(self, source: Path, *, report: Progress | None = None, **about: str) -> "JsonObject":
@@ -128,8 +128,8 @@ class Client:
         """Yields kind and document of each event of a job until the job ends. Reconnects after an interruption without
         repeating events.
 
-        Raises Unreachable if no connection succeeds for ``patience_s`` seconds. The time between two events is not
-        limited.
+        Raises Unreachable if no connection succeeds for ``patience_s`` seconds. The method waits for the next event
+        without a time limit.
         """
         last, deadline = "0", time.monotonic() + self._patience_s
         while True:
@@ -149,7 +149,7 @@ class Client:
             time.sleep(0.3)
 
     def wait(self, job_id: str, *, report: Progress | None = None) -> "JsonObject":
-        """Waits until the job ends and returns its document. Raises JobEnded if it failed or was cancelled."""
+        """Waits until the job ends and returns its document. Raises JobEnded if the job failed or was cancelled."""
         for kind, document in self.events(job_id):
             if kind == "end":
                 if document["state"] != "succeeded":
@@ -161,7 +161,7 @@ class Client:
 
     def download(self, job_id: str, folder: Path) -> list[Path]:
         """Writes the files of a job's result into ``folder``, replacing an earlier result, and returns their paths.
-        Raises ServiceError if a file does not have its SHA-256; the folder then stays as it was."""
+        Raises ServiceError, without changing the folder, if a file does not have its SHA-256."""
         job = self.get(f"/v1/jobs/{job_id}")
         with fresh_folder(folder) as fresh:
             for name, described in job["files"].items():
@@ -193,7 +193,7 @@ class Client:
 
     def _send_part(self, location: str, stream: Any, offset: int) -> tuple[int, str | None]:
         """Sends one PATCH and returns the new offset (bytes) and the capture's address once the upload is complete.
-        After a failure it asks the service by HEAD for the number of bytes received."""
+        After a failed PATCH the client asks the service by HEAD for the number of bytes received."""
         stream.seek(offset)
         data = stream.read(PART_BYTES)
         checksum = "sha256 " + base64.b64encode(hashlib.sha256(data).digest()).decode()
@@ -212,8 +212,8 @@ class Client:
 
     @contextmanager
     def _stream(self, job_id: str, last: str) -> Iterator[Iterator[tuple[str, str, Any]]]:
-        """Opens one connection and yields its events: kind, id and document. Raises httpx.TransportError if it cannot
-        be opened."""
+        """Opens one connection and yields its events: kind, id and document. Raises httpx.TransportError if the
+        connection fails."""
         headers = {"Last-Event-ID": last, "Accept": "text/event-stream"}
         timeout = httpx.Timeout(10.0, read=30.0)  # the service sends a comment every 15 s
         with self._http.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers, timeout=timeout) as response:

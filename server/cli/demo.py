@@ -30,9 +30,9 @@ class ServiceDied(EigenheadError):
 
 
 def run_demo(out: Path, *, seed: int, full: bool, report: Progress) -> dict[str, Any]:
-    """Starts a service in a temporary data folder, triggers its simulated rig with the subject of ``seed``, submits a
-    job, waits for it, and downloads its result into ``out``. ``full``: the default job, with the dense stage; otherwise
-    a head at level ``photo``. Returns what ``demo --json`` prints: files, ``error_mm`` from the truth, warnings."""
+    """Starts a service in a temporary data folder, triggers its simulated rig with the subject of ``seed``, runs a job,
+    and downloads the job's result into ``out``. ``full``: whether to run the default job, with the dense stage, or a
+    short job (level ``photo``). Returns what ``demo --json`` prints: files, ``error_mm`` from the truth, warnings."""
     began = time.monotonic()
     requested: dict[str, object] = {} if full else {"detail": "photo", "outputs": {"surface": "head"}}
     prepare_kernels(lambda stage, _: report(stage, 0.0), settings_from_document(requested))

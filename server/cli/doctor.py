@@ -39,7 +39,7 @@ MEMORY_LEAST = 2 << 30  # a job takes up to 1.5 GB
 
 def examine(settings: ServiceSettings) -> dict[str, dict[str, Any]]:
     """Runs every check of this machine. Returns by name whether the check passed (``ok``) and its finding or remedy
-    (``detail``). Only reads: it makes neither folders nor tables."""
+    (``detail``). The checks make neither folders nor database tables."""
     checks = (
         *(_python, _egl, _gpu, _model, _cores, _memory, _data, _models, _cache, _database, _retention, _results),
         *(_variables, _rig, _stores, _port),
@@ -146,8 +146,8 @@ def _database(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _results(settings: ServiceSettings) -> tuple[bool, str]:
-    """Compares the files of succeeded jobs' results with their records, newest first, for ``COMPARE_S`` seconds; names
-    jobs without a result folder (removed by hand, or missing from a restored backup), and changed files."""
+    """Compares the result files of succeeded jobs with their records, newest first, for ``COMPARE_S`` seconds. The
+    check names changed files, and jobs without a result folder (removed by hand, or missing in a restored backup)."""
     kind = _kind(settings)
     connection = _connected(settings)
     if connection is None:
@@ -233,7 +233,7 @@ def _rig(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _stores(settings: ServiceSettings) -> tuple[bool, str]:
-    """Lists the first object of each object store; whether the service may write there is seen only at a delivery."""
+    """Lists the first object of each object store; whether the service may write there, only a delivery shows."""
     stores = [place for place in (settings.captures_store, settings.results_store) if place is not None]
     places = dict.fromkeys([*settings.import_prefixes, *settings.deliver_prefixes, *stores])
     if not places:

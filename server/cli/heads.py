@@ -36,7 +36,7 @@ app = typer.Typer(rich_markup_mode=None)
 
 
 class LimitsMissed(EigenheadError):
-    """Reports that a figure exceeds its limit. Report and certificate have already been written."""
+    """Reports that a figure of a verification exceeds its limit. Report and certificate have already been written."""
 
     def __init__(self, document: "VerificationReport", out: Path) -> None:
         missed = [
@@ -54,8 +54,8 @@ def _templates() -> tuple[str, ...]:
 
 
 def format_names(value: str | None) -> str | None:
-    """Checks a list of file formats separated by commas and returns it without spaces. Raises typer.BadParameter for a
-    name that is none of ``FORMATS``."""
+    """Checks a list of file formats separated by commas and returns the list without spaces. Raises typer.BadParameter
+    for a name that is none of ``FORMATS``."""
     from pipeline.settings import FORMATS
 
     names = [] if value is None else [name.strip() for name in value.split(",")]
@@ -275,8 +275,8 @@ def verify_captures(
     """Judges captures of a mannequin, or their results, by comparison with the scan ``reference``. Writes report.json
     and certificate.pdf into ``out``, and results of captures into ``out/results``.
 
-    The reference is checked before anything is reconstructed. Raises InputError, also if results were made with
-    different models, and the errors of the pipeline.
+    The scan is checked before any capture is reconstructed. Raises InputError, for example if results were made with
+    different head models, and the pipeline's errors.
     """
     from pipeline.applications.verification.judgement import judge
     from pipeline.applications.verification.measured import identity_of, is_result, read_measured
@@ -314,8 +314,8 @@ def verify_captures(
 
 
 def read_limits(path: Path | None) -> "Limits":
-    """Reads limits from a TOML or JSON file. Limits that the file omits, or all without a file, have their defaults.
-    Raises InputError."""
+    """Reads limits from a TOML or JSON file. Limits that the file omits, or all limits if ``path`` is None, have their
+    default values. Raises InputError."""
     from pipeline.applications.verification.judgement import Limits
     from rig.typed_tables import read_table
     from server.tasks.settings_file import settings_document
@@ -335,7 +335,7 @@ def verification_lines(document: "VerificationReport", out: Path) -> list[str]:
 
 
 def capture_names(captures: Sequence[Path]) -> list[str]:
-    """Returns the captures' names. Raises InputError if two names are equal."""
+    """Returns the captures' names. Raises InputError if two captures have the same name."""
     names = [path.resolve().name.removesuffix(".gz").removesuffix(".tar").removesuffix(".zip") for path in captures]
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
@@ -344,7 +344,7 @@ def capture_names(captures: Sequence[Path]) -> list[str]:
 
 
 def head_alone(settings: Mapping[str, object]) -> dict[str, object]:
-    """Returns the settings with the bust switched off, because the check needs only the head; this saves ten seconds
-    for each capture."""
+    """Returns the settings with the bust switched off, because a verification needs only the head, which saves ten
+    seconds for each capture."""
     outputs = settings.get("outputs")
     return {**settings, "outputs": {"surface": "head", **(outputs if isinstance(outputs, Mapping) else {})}}

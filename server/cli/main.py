@@ -1,4 +1,4 @@
-"""Implements the command ``eigenhead``. Commands import heavy modules when they run, so that ``--help`` answers at
+"""Implements the command ``eigenhead``. Each command imports heavy modules when it runs, so that ``--help`` answers at
 once."""
 
 import os
@@ -26,7 +26,7 @@ THREADS, ALONE = "Of compiled loops; all processors by default.", "No progress a
 
 
 class Commands(TyperGroup):
-    """Lists the commands by purpose. Adds the common options to each command, and prints each example on a line."""
+    """Lists the commands by purpose, adds the common options to each command, and prints each example on a line."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
@@ -90,8 +90,8 @@ def of_all(
 
 
 def main() -> None:
-    """Runs the command line. The exit status is 0 if it succeeded, 1 if it failed (one line on stderr), 2 for wrong
-    usage."""
+    """Runs the command line. The exit status is 0 if the command succeeded, 1 if it failed (one line on stderr), 2 for
+    wrong usage."""
     # Set before NumPy is loaded, here and in workers. On small systems BLAS threads spin longer than they work: beside
     # another busy process a fit took five times the processor time.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -123,7 +123,7 @@ def sequence(
 
 
 def film_sequence(out: Path, frames: int, seed: int, preset: "Preset", json_out: bool) -> None:
-    """Films a moving subject of the simulated studio with 640 x 480 cameras, and writes the pictures into ``out``."""
+    """Films a moving subject in the simulated studio with cameras of 640 x 480 px; writes the pictures into ``out``."""
     import numpy as np
 
     from pipeline.applications.moments.footage import TRACKED_PIXELS

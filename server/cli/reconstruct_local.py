@@ -33,9 +33,9 @@ def reconstruct_locally(
 ) -> "ReportDocument":
     """Reconstructs a capture folder or archive into ``out`` and returns the content of report.json.
 
-    Estimated cameras and masks stay in ``out`` even if a later stage fails; an earlier result stays until the new one
-    is complete. Settings, model, template, capture, ``out`` and ``trace`` are checked before heavy modules are loaded.
-    The file ``trace`` records which thread ran which code and when, even if the job fails.
+    Estimated cameras and masks stay in ``out`` even if a later stage fails; an earlier result in ``out`` stays until
+    the new result is complete. Settings, model, template, capture, ``out`` and ``trace`` are checked before heavy
+    modules are loaded. The file ``trace`` records which thread ran which code and when, even if the job fails.
     """
     from pipeline.applications.templates.header import check_template
     from pipeline.settings import settings_from_document
@@ -98,7 +98,7 @@ def check_apart(out: Path, capture: Path, option: str = "--out") -> None:
 
 @contextmanager
 def _traced(path: Path | None) -> Iterator[None]:
-    """Records what runs in the block and writes it to ``path``, also if the block raises."""
+    """Records which code runs in the block and writes the record to ``path``, even if the block raises."""
     if path is None:
         yield
         return

@@ -60,7 +60,7 @@ def worker(
 
 
 def _worker_lives(settings: "ServiceSettings") -> bool:
-    """Returns whether a worker of this host is alive; True if the database is away, since workers survive that."""
+    """Returns whether a worker of this host is alive; True if the database, whose loss workers survive, is away."""
     import platform
 
     import sqlalchemy as sa

@@ -182,7 +182,7 @@ def _make_way(out: Path, overwrite: bool, sign: str = "cameras.json") -> None:
 
 
 def _serve_studio(folder: Path, json_out: bool, **options: Any) -> None:
-    """Serves the simulated studio until Ctrl-C, which ends it with status 0."""
+    """Serves the simulated studio until Ctrl-C, which ends the command with status 0."""
     from contextlib import ExitStack, suppress
 
     from server.cli.studio import serve_studio, studio_lines

@@ -37,7 +37,7 @@ def describe_studio(devices: StudioDevices, truth: Path) -> dict[str, Any]:
 
 
 def studio_lines(studio: Mapping[str, Any]) -> list[str]:
-    """Returns lines for people: the devices, and commands to try on them."""
+    """Returns lines for people: the devices of the studio, and commands to try on these devices."""
     url, rig, first = studio["url"], studio["rig"], next(iter(studio["cameras"]))
     return [
         "The simulated studio is open; Ctrl-C closes it.",
@@ -75,8 +75,8 @@ def serve_studio(
     """Serves the subject that ``eigenhead simulate`` draws for the same ``seed``, until SIGINT or SIGTERM.
 
     Writes rig.toml, cameras.json and clean plates into ``folder``, and the true head into ``<folder>.truth``. ``ready``
-    is called with ``describe_studio`` once all devices can be used. Afterwards no thread, port or pseudo-terminal is
-    left. Raises InputError for a folder of another rig, a wrong fault, or a port in use.
+    is called with ``describe_studio`` once all devices can be used. When the function returns, no thread, port or
+    pseudo-terminal is left. Raises InputError for a folder of another rig, an unknown fault, or a port in use.
     """
     planted = [device_fault_from_text(text) for text in faults]
     _check_folder(folder)

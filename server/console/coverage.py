@@ -24,8 +24,8 @@ Corners = dict[str, list[list[float]]]  # of a shot, by camera: shares of the im
 
 
 def detect_shot(context: WorkerContext, report: Progress, *, files: str, board: Mapping[str, object]) -> Corners:
-    """Finds the corners of the board in each image of a capture, in a child process. Returns them by camera, as
-    fractions of width and height; without a board the list is empty. Raises InputError for an impossible board."""
+    """Finds the corners of the board in each image of a capture, in a child process. Returns the corners by camera, as
+    fractions of width and height; the list is empty without a board. Raises InputError for an impossible board."""
     described = board_from_document(board)
     corners = {}
     for number, path in enumerate(sorted((Path(files) / "images").iterdir())):
@@ -40,8 +40,8 @@ def detect_shot(context: WorkerContext, report: Progress, *, files: str, board: 
 
 
 def covered(corners: Float[np.ndarray, "n 2"]) -> float:
-    """Computes the fraction of a picture's ``CELLS`` that hold a corner of the board. Corners are fractions of width
-    and height."""
+    """Computes the fraction of a picture's ``CELLS`` that hold a corner of the board. The coordinates of a corner are
+    fractions of width and height."""
     if len(corners) == 0:
         return 0.0
     cells = np.clip((corners * CELLS).astype(int), 0, np.array(CELLS) - 1)
@@ -49,9 +49,9 @@ def covered(corners: Float[np.ndarray, "n 2"]) -> float:
 
 
 def summary(cameras: list[str], shots: list[Corners]) -> list[JsonObject]:
-    """Computes the coverage of each camera by the shots so far: the number of pictures that show the board (``views``),
-    the fraction ``covered``, whether that is enough, and ``corners`` of earlier shots and of the ``last``, as fractions
-    of width and height."""
+    """Computes how much of each camera's picture the board has covered so far: the number of pictures that show the
+    board (``views``), the fraction ``covered``, whether this is enough, and the ``corners`` in earlier shots and in the
+    ``last`` shot, as fractions of width and height."""
     lines: list[JsonObject] = []
     for name in cameras:
         seen = [shot[name] for shot in shots if shot.get(name)]

@@ -1,7 +1,7 @@
 """Computes aids for picking one feature point in several views: epipolar guides, the triangulated point, the model's
 landmark.
 
-Its inputs are only a rig and pixels. An epipolar guide includes lens distortion, so it is a curve.
+The module's inputs are only a rig and pixels. An epipolar guide includes lens distortion, so it is a curve.
 """
 
 from collections.abc import Collection, Mapping
@@ -33,7 +33,7 @@ OUTSIDE = 0.25  # of the image: guides go so far beyond its rim
 
 def guide(rig: Rig, source: str, pixel: Float[np.ndarray, " 2"], target: str) -> Float[np.ndarray, "n 2"]:
     """Computes the curve (px) at which the camera ``target`` sees the line of sight through a pixel of the camera
-    ``source``. It is empty if the target sees none of it."""
+    ``source``. The curve is empty if the target sees nothing of the line of sight."""
     camera = rig[source]
     ray = camera.rays_world(np.asarray(pixel, float)[None])[0]
     middle = float((rig.centre_world() - camera.centre_world) @ ray)
@@ -44,8 +44,8 @@ def guide(rig: Rig, source: str, pixel: Float[np.ndarray, " 2"], target: str) ->
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """Holds the triangulation of one point from its picked pixels. ``position`` (world frame, mm) is None if it cannot
-    be triangulated."""
+    """Holds the triangulation of one point from its picked pixels. ``position`` (world frame, mm) is None if the point
+    cannot be triangulated."""
 
     position: Float[np.ndarray, " 3"] | None
     reprojected: dict[str, list[float]]
@@ -54,8 +54,8 @@ class Located:
 
 
 class Guides:
-    """Computes the aids for picking feature points in the pictures of one rig. It caches results and recomputes only
-    those that a change affects, so the cost of a click does not grow with the number of points."""
+    """Computes the aids for picking feature points in the pictures of one rig. The class caches results and recomputes
+    only those that a change affects, so the cost of a click does not grow with the number of points."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -121,8 +121,8 @@ class Guides:
 
 
 def locate(rig: Rig, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) -> Located:
-    """Triangulates one point from the pixels picked in several views, and finds the pixels that contradict the others;
-    a job would leave these out."""
+    """Triangulates one point from the pixels picked in several views, and finds the pixels that contradict the others,
+    which a job would leave out."""
     try:
         landmark = triangulate(views, rig, noise_px=CLICK_NOISE_PX)
     except NoPoint:
@@ -137,7 +137,7 @@ def predicted(
     rig: Rig, located: Mapping[str, Float[np.ndarray, " 3"]], landmarks: Mapping[str, Float[np.ndarray, " 3"]]
 ) -> dict[str, dict[str, list[float]]]:
     """Predicts the pixels of the model's landmarks in every view. The points in ``located`` (world frame, mm) determine
-    the pose of the mean head. Returns nothing if fewer than three of them are landmarks, or if these lie on a line."""
+    the mean head's pose. Returns nothing if fewer than three points are landmarks, or if they lie on a line."""
     names = [name for name in located if name in landmarks]
     if len(names) < POINTS_LEAST:
         return {}
@@ -150,14 +150,14 @@ def predicted(
 
 
 def nearest_views(rig: Rig, front: str, count: int) -> list[str]:
-    """Returns the names of ``count`` cameras: ``front`` and those with the most similar viewing directions."""
+    """Returns the names of ``count`` cameras: ``front`` and the cameras with the most similar viewing directions."""
     axes = {camera.name: camera.camera_from_world.rotation[2] for camera in rig}
     return sorted(axes, key=lambda name: (name != front, -float(axes[name] @ axes[front])))[:count]
 
 
 def mean_landmarks(context: WorkerContext, report: Progress, *, model: str, names: list[str]) -> dict[str, list[float]]:
-    """Returns the landmarks of a model's mean head (head frame, mm). Runs in a child process, since a model is
-    large."""
+    """Returns the landmarks of a model's mean head (head frame, mm). The function runs in a child process, since a head
+    model is large."""
     from pipeline.head_model.model import load_model
 
     loaded = load_model(model)
@@ -185,5 +185,5 @@ def _near_image(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> np.ndarray:
 
 
 def _together(remarks: tuple[Message, ...]) -> Message | None:
-    """Joins all remarks to one; returns None if there are none."""
+    """Joins all remarks to one message; returns None if there are no remarks."""
     return compose("several", messages=remarks) if len(remarks) > 1 else next(iter(remarks), None)

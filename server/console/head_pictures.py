@@ -1,9 +1,9 @@
-"""Draws pictures of a job's head at the first request, one at a time, and keeps them beside the result; they are
-removed with the job.
+"""Draws pictures of a job's head at the first request, one at a time, and stores them beside the result, with which
+they are removed.
 
 The page Result shows ``first-view.jpg`` (some 30 kB) until the browser has loaded and drawn the 3 MB of the head.
-Position, lens and light are those of ``pages/result.js`` and ``static/views.js``: three-quarter view, light "studio",
-texture. Lists show ``portrait.jpg``, by which people recognise a head at once.
+Camera, light and texture are as in ``pages/result.js`` and ``static/views.js``: three-quarter view, light "studio".
+Lists show ``portrait.jpg``, by which people recognise a head at once.
 """
 
 import json
@@ -51,8 +51,8 @@ MARGIN = 1.12  # of the head's box, for hair
 
 
 def result_folder(service: Service, job_id: str) -> Path:
-    """Returns the folder of a job's result, with all its files. Raises NotFound, and Conflict if the job has not
-    succeeded."""
+    """Returns the folder of a job's result, with all its files. Raises NotFound for an unknown job, and Conflict if the
+    job has not succeeded."""
     local = _local_folder(service, job_id)
     return service.jobs.result_folder(job_id) if service.jobs.results.objects is not None else local
 
@@ -67,8 +67,8 @@ def _local_folder(service: Service, job_id: str) -> Path:
 
 
 def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
-    """Returns the file of a picture of a job's head, which the first call draws. Raises NotFound if the job or its head
-    is gone, Conflict if the job has not succeeded, and InputError if the head cannot be read."""
+    """Returns the file of a picture of a job's head; the first call draws the picture. Raises NotFound if the job or
+    its head is gone, Conflict if the job has not succeeded, and InputError if the head cannot be read."""
     stored = _local_folder(service, job_id).parent / name
     if not stored.is_file():
         with _drawing:
@@ -82,7 +82,7 @@ def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
 
 
 def draw_first_view(service: Service, job_id: str) -> None:
-    """Draws the first view of a head before the page requests it. Raises nothing if the head is gone."""
+    """Draws the first view of a head before the page requests it. A head that was removed raises no error."""
     with suppress(EigenheadError, OSError):  # removed meanwhile, or a result without a head: the page tells
         head_picture(service, job_id, "first-view.jpg")
 

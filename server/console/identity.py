@@ -1,8 +1,8 @@
 """Identifies the user of a page: anybody on this machine if there are no API keys, otherwise a key's owner.
 
-The session does not store the key itself. The user storage of the browser's session (a file in the data folder, named
-by a signed cookie) holds the key's id, and every refresh of a page looks the key up in the database. So the pages close
-when the key is removed, and a sign-in survives a restart of the service.
+The browser's session does not store the API key itself. The user storage of the browser's session (a file in the data
+folder, named by a signed cookie) holds the API key's id, and every refresh of a page looks the key up in the database.
+So the pages close when the API key is removed, and a sign-in survives a restart of the service.
 """
 
 import secrets
@@ -25,7 +25,7 @@ KEY_ID = "key_id"
 
 
 def service_of_pages() -> Service:
-    """Returns the running service. It exists as long as the pages do."""
+    """Returns the running service. The service exists as long as its pages do."""
     return pages.state.eigenhead.state.service
 
 
@@ -40,8 +40,8 @@ def caller_of(service: Service, stored: Mapping[str, object]) -> Caller | None:
 
 
 def permit(caller: Caller | None, scope: str) -> Caller:
-    """Returns ``caller`` if it has the scope. Raises Unauthenticated for None, and Forbidden for a caller without the
-    scope."""
+    """Returns ``caller`` if the caller has the scope. Raises Unauthenticated if the caller is None, and Forbidden for a
+    caller without the scope."""
     if caller is None:
         raise Unauthenticated("key-missing", compose("sign-in-again"))
     caller.check_may(scope)
@@ -50,7 +50,7 @@ def permit(caller: Caller | None, scope: str) -> Caller:
 
 def cookie_secret(data: Path) -> str:
     """Returns the secret that signs session cookies. The secret is made once and stored in the data folder, so a
-    restart signs nobody out."""
+    restart of the service signs nobody out."""
     path = data / "console" / "secret"
     if not path.is_file() or not path.stat().st_size:  # an empty one is left where a full disk met the first start
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -68,7 +68,7 @@ def is_foreign(scope: Scope, settings: ServiceSettings) -> bool:
 
 def is_rebound(scope: Scope, settings: ServiceSettings) -> bool:
     """Returns whether a request names a host that is neither loopback nor the public one, although the service listens
-    on loopback only. A browser sends such requests in an attack by DNS rebinding."""
+    on loopback only, as a browser does in an attack by DNS rebinding."""
     host = Headers(scope=scope).get("host", "")
     name = host.rpartition(":")
     return is_loopback(settings.host) and host != settings.public_host and not is_loopback(name[0] or name[2])

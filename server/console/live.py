@@ -1,4 +1,4 @@
-"""Provides the live view: one thread takes pictures while a page is open, and every open page gets them."""
+"""Provides the live view: one thread takes pictures while a page is open, and every open page gets the pictures."""
 
 import asyncio
 import json
@@ -38,7 +38,7 @@ def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> JsonObject:
 
 def rig_frames(rig: RigBackend, child: Child, look: int) -> list[JsonObject]:
     """Returns the current picture of each camera, with its measurements. ``child`` draws the simulated studio; real
-    cameras take their pictures at once, and the sharpness of one of them, in turn, is measured at full size. ``look``
+    cameras take their pictures at once, and the sharpness of one camera, in turn, is measured at full size. ``look``
     counts the calls. Raises Unavailable if the rig cannot be opened."""
     described = rig.describe()
     if described.kind == "simulated":
@@ -48,8 +48,8 @@ def rig_frames(rig: RigBackend, child: Child, look: int) -> list[JsonObject]:
 
 
 class LiveView:
-    """Holds the newest pictures of all cameras, numbered. Its thread takes pictures while pages are open, and ends
-    ``KEEP_S`` seconds after the last page closed."""
+    """Holds the newest pictures of all cameras, numbered. The view's thread takes pictures while pages are open, and
+    ends ``KEEP_S`` seconds after the last page closed."""
 
     def __init__(self, service: Service) -> None:
         self._service = service
@@ -61,7 +61,7 @@ class LiveView:
 
     async def stream(self) -> AsyncIterator[bytes]:
         """Yields the pictures of all cameras as they are taken, each time as one message of ``look_bytes``. Starts the
-        thread if needed."""
+        thread that takes the pictures if needed."""
         shown = 0
         while True:
             self._watch()
@@ -119,8 +119,8 @@ class LiveView:
 
 def look_bytes(frames: list[JsonObject], fault: Message | None, head: object = None) -> bytes:
     """Encodes the pictures of all cameras as one message: 4 bytes with the header's length, 4 with the length of the
-    rest (both big-endian), a JSON header, and the JPEG files in the header's order. ``bytes`` in the header is the
-    length of each file."""
+    rest (both big-endian), a JSON header, and the JPEG files in the header's order. The header's ``bytes`` holds the
+    length of each JPEG file."""
     header = [{k: v for k, v in f.items() if k != "jpeg"} | {"bytes": len(f["jpeg"] or b"")} for f in frames]
     text = json.dumps({"cameras": header, "fault": None if fault is None else fault.document(), "head": head}).encode()
     body = b"".join(f["jpeg"] or b"" for f in frames)

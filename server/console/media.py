@@ -78,8 +78,8 @@ _finding: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)  # face
 
 
 def session(scope: str) -> Any:
-    """Returns a FastAPI dependency that yields the service and the caller of the browser's session. It raises
-    Unauthenticated, and Forbidden for a caller without ``scope``."""
+    """Returns a FastAPI dependency that yields the service and the caller of the browser's session. The dependency
+    raises Unauthenticated for an unknown caller, and Forbidden for a caller without ``scope``."""
 
     async def authenticate() -> tuple[Service, Caller]:
         service, stored = service_of_pages(), dict(pages.storage.user)
@@ -162,13 +162,13 @@ def silhouette(who: Reader, capture_id: str, camera: str) -> Response:
 
 @pages.get("/console/captures/{capture_id}/faces")
 def faces(who: Reader, capture_id: str) -> Response:
-    """Returns the faces in a capture's pictures with their points (px). The first request finds them."""
+    """Returns the faces in a capture's pictures with their points (px). The first request detects the faces."""
     return JSONResponse(found_faces(who[0], capture_id)["faces"], headers=FOREVER)
 
 
 @pages.post("/console/captures")
 async def upload(who: Taker, request: Request) -> Response:
-    """Receives an archive and makes a capture of it. Answers 201 with its id, or a problem document."""
+    """Receives an archive and makes a capture of it. Answers 201 with the capture's id, or a problem document."""
     try:
         record, _ = await receive_capture(who[0], request, who[1].key)
     except Exception as error:
@@ -178,8 +178,8 @@ async def upload(who: Taker, request: Request) -> Response:
 
 @pages.post("/console/calibrations")
 async def upload_calibration_pictures(who: Taker, request: Request) -> Response:
-    """Receives an archive of board pictures or photographs and queues a calibration. Answers 202 with its id, or a
-    problem document."""
+    """Receives an archive of board pictures or photographs and queues a calibration. Answers 202 with the calibration's
+    id, or a problem document."""
     try:
         calibration = await receive_calibration_pictures(who[0], request, who[1].key)
     except Exception as error:
@@ -189,7 +189,7 @@ async def upload_calibration_pictures(who: Taker, request: Request) -> Response:
 
 @pages.get("/console/jobs/{job_id}/overlays/{name}")
 def overlay_file(who: Reader, request: Request, job_id: str, name: str) -> Response:
-    """Returns an overlay of a job's result: a photograph with the input contour and the fitted one."""
+    """Returns an overlay of a job's result: a photograph with the input contour and the fitted contour."""
     return send_file(request, who[0].jobs.result_file(job_id, f"overlays/{name}"))
 
 
@@ -221,8 +221,8 @@ def first_view(who: Reader, job_id: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/cameras")
 def cameras(who: Reader, job_id: str) -> Response:
-    """Returns the cameras of a job's capture as seen from the head. The list is empty if the capture was removed or the
-    report has no pose of the head."""
+    """Returns the cameras of a job's capture as seen from the head. The list of cameras is empty if the capture was
+    removed or the report has no pose of the head."""
     service, views = who[0], []
     report = result_folder(who[0], job_id) / "report.json"
     with suppress(NotFound, FileNotFoundError, KeyError):
@@ -233,7 +233,7 @@ def cameras(who: Reader, job_id: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/photographs/{camera}.jpg")
 def photograph(who: Reader, job_id: str, camera: str) -> Response:
-    """Returns a photograph of the job's capture without lens distortion. It is made at the first request and cached."""
+    """Returns a photograph of the job's capture without lens distortion, which the first request makes and caches."""
     service = who[0]
     capture, record = _capture_files(service, job_id)
     name = _image_name(record, camera)
@@ -306,7 +306,7 @@ def batch_sheet(who: Reader, batch_id: str, form: SheetFormat) -> Response:
 
 @pages.get("/console/calibrations/{calibration_id}/report.html")
 def calibration_report(who: Reader, request: Request, calibration_id: str) -> Response:
-    """Returns the report of a calibration, an HTML page in which no script may run."""
+    """Returns the report of a calibration, an HTML page in which the browser runs no script."""
     answer = send_file(request, who[0].calibrations.file(calibration_id, "report.html"))
     answer.headers["Content-Security-Policy"] = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:"
     return answer
@@ -319,8 +319,8 @@ def cameras_file(who: Reader, calibration_id: str) -> Response:
 
 
 def make_thumbnail(source: Path, target: Path) -> None:
-    """Writes a JPEG file of at most ``THUMBNAIL_WIDTH`` pixels of width. The file appears under its name only when it
-    is complete."""
+    """Writes a JPEG file of at most ``THUMBNAIL_WIDTH`` pixels of width. The thumbnail appears under its name only when
+    it is complete."""
     target.parent.mkdir(parents=True, exist_ok=True)
     unfinished = target.with_suffix(f".{threading.get_ident()}")
     with open_picture(source) as picture:
@@ -350,7 +350,7 @@ def _floats(values: np.ndarray) -> Response:
 
 def draw(context: WorkerContext, report: Progress, *, capture: str, cache: str, target: str) -> None:
     """Draws the subject's outline in each picture of a capture as ``target``/<camera>.png, transparent outside.
-    Silhouettes come from the folder ``cache`` or are stored there. Raises InputError."""
+    Silhouettes are read from the folder ``cache``, or computed and stored there. Raises InputError."""
     from server.storage.silhouette_cache import segment_once
     from server.tasks.photographs import read_scaled_capture
 
@@ -373,8 +373,8 @@ def outline(mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "y x 4"]:
 
 def camera_views(rig: Rig, report: Report) -> list[JsonObject]:
     """Returns every camera of a capture as seen from the head, as a pinhole camera (px) with ``camera_from_head``: rows
-    of a 4 x 4 matrix (metres) in the frame of head.glb. The head's pose comes from ``report``, its size is the true
-    one: x_world = R x_head + s t."""
+    of a 4 x 4 matrix (metres) in the frame of head.glb. The head's pose comes from ``report``, and the head has its
+    true size: x_world = R x_head + s t."""
     pose = report["world_from_head"]
     shift = np.array(pose["translation"]) * pose["scale"]
     world_from_head = RigidTransform(np.array(pose["rotation"]), shift)
@@ -382,7 +382,7 @@ def camera_views(rig: Rig, report: Report) -> list[JsonObject]:
 
 
 def rig_of(capture: Path) -> Rig:
-    """Reads the rig from the files of a capture. Raises InputError if there is none or it cannot be read."""
+    """Reads the rig from the files of a capture. Raises InputError if there is no rig or the rig cannot be read."""
     rig_file = find_rig_file(capture)
     if rig_file is None:
         raise InputError("capture", [compose("no-cameras-json")])
@@ -405,8 +405,8 @@ def straightened(image: ImageRgb, camera: Camera) -> ImageRgb:
 
 
 def straightened_face(face: JsonObject, camera: Camera) -> JsonObject:
-    """Converts a face to the pixels of the photograph without distortion, at full size. Points outside the lens are
-    left out."""
+    """Converts a face to the pixels of the photograph without distortion, at full size. Points that the lens cannot
+    image are left out."""
     lens, pixels = camera.intrinsics, np.array(face["points"])
     if camera.recorded is not None:
         straight = camera.recorded.undistorted(pixels, lens.matrix())
@@ -425,8 +425,8 @@ def _view(camera: Camera, camera_from_head: RigidTransform) -> JsonObject:
 
 
 def vertex_numbers(path: Path, name: str) -> Float[np.ndarray, " v"]:
-    """Reads one number for each vertex of a result's surface. Raises NotFound if the file has no such number, and
-    InputError for another program's file."""
+    """Reads one number for each vertex of a result's surface. Raises NotFound if the file does not have the number
+    ``name``, and InputError for another program's file."""
     values = read_vertex_numbers(path, name)
     if values is None:
         raise NotFound(compose("thing-vertex-number"), name, compose("hint-other-numbers", file=path.name))
@@ -436,7 +436,7 @@ def vertex_numbers(path: Path, name: str) -> Float[np.ndarray, " v"]:
 def to_surface(result: Path, other: Path, *, align: bool = False) -> Float[np.ndarray, " v"]:
     """Computes the distance (mm) of every vertex of a result's head to the surface of the mesh ``other``.
 
-    With ``align`` the result's head is first moved rigidly onto the other one, since heads of different captures stand
+    With ``align`` the result's head is first moved rigidly onto the other head, since heads of different captures stand
     in different places. Raises FileNotFoundError.
     """
     mine, theirs = read_mesh(result / "head.ply"), read_mesh(other)
@@ -446,8 +446,8 @@ def to_surface(result: Path, other: Path, *, align: bool = False) -> Float[np.nd
 
 def moved_onto(mine: Mesh, theirs: Mesh) -> Float[np.ndarray, "v 3"]:
     """Returns the vertices of ``mine`` after the rigid motion that brings them closest to ``theirs``. Heads with
-    equally many vertices are compared vertex by vertex. Other heads are compared by nearest points, without the
-    farthest fifth."""
+    equally many vertices are compared vertex by vertex. Heads with different numbers of vertices are compared by
+    nearest points, without the farthest fifth."""
     if len(mine.vertices) == len(theirs.vertices):
         return rigid_procrustes(mine.vertices, theirs.vertices).apply(mine.vertices)
     points = mine.vertices - mine.vertices.mean(0) + theirs.vertices.mean(0)
@@ -460,10 +460,10 @@ def moved_onto(mine: Mesh, theirs: Mesh) -> Float[np.ndarray, "v 3"]:
 
 
 def found_faces(service: Service, identity: str) -> JsonObject:
-    """Returns the faces in a capture's pictures. The first call finds them; later ones read the cache. Blocks.
+    """Returns the faces in a capture's pictures. The first call detects the faces; later calls read the cache. Blocks.
 
-    Raises NotFound, Conflict for a shot of the board, InputError and WorkFailed if the pictures cannot be searched, and
-    Unavailable after ``PATIENCE_S`` seconds.
+    Raises NotFound, Conflict for a shot of the calibration board, InputError and WorkFailed if the pictures cannot be
+    searched, and Unavailable after ``PATIENCE_S`` seconds.
     """
     deadline = time.monotonic() + PATIENCE_S
     record = service.store.capture(identity)

@@ -30,9 +30,9 @@ FOLDERS = ("/_nicegui", "/console/", "/features/", "/result/")
 
 
 def mount_console(app: FastAPI, settings: ServiceSettings) -> None:
-    """Adds the pages to the service's app, at ``/``. The API handles all other addresses.
+    """Adds the pages to the service's app, at ``/``. The HTTP API handles all addresses that are not pages.
 
-    NiceGUI has only one app in each process. If several services run in one process, the last one has the pages.
+    NiceGUI has only one app in each process. If several services run in one process, the last service has the pages.
     """
     from server.console import media  # noqa: F401 - they add their routes to NiceGUI's app
     from server.console.pages import (  # noqa: F401
@@ -119,8 +119,8 @@ class PagesMount(Mount):
         return super().matches(scope)
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serves a request, or refuses it with status 403 (a websocket with code 1008) if it comes from a foreign web
-        page."""
+        """Serves a request, or refuses it with status 403 (a websocket with code 1008) if the request comes from a
+        foreign web page."""
         if is_foreign(scope, self._settings) or is_rebound(scope, self._settings):
             if scope["type"] == "websocket":
                 await send({"type": "websocket.close", "code": 1008})

@@ -54,10 +54,10 @@ _threads = anyio.CapacityLimiter(16)  # actions and looks of all pages; a captur
 @dataclass(frozen=True, slots=True)
 class Action:
     """Describes the action that an event of a page runs. ``function(page, event)`` runs in a thread, for callers with
-    ``scope``. ``page`` is the page on which the event happened, ``event`` what its component sent: an ``id``, or the
-    fields of a form.
+    ``scope``. ``page`` is the page on which the event happened, and ``event`` is what the page's component sent: an
+    ``id``, or the fields of a form.
 
-    A message that the function returns is shown in the corner; an error is shown there with its faults.
+    A message that the action's function returns, or an error with its faults, is shown in the page's corner.
     """
 
     scope: str
@@ -66,7 +66,7 @@ class Action:
 
 @dataclass
 class Cache:
-    """Caches values that all open pages show, so that they agree and ten pages cost no more than one.
+    """Caches values that all open pages show, so that the pages agree and ten pages cost no more than one page.
 
     A value is kept at least ``KEEP_TIMES`` times its computing time, up to ``KEEP_MOST_S`` seconds, so that computing
     takes at most a tenth of the time.
@@ -78,8 +78,8 @@ class Cache:
     _forgets: int = 0
 
     def get(self, key: Any, age_s: float, make: MAKE) -> Any:
-        """Returns the value of ``key``. If it is older than ``age_s`` seconds, ``make`` computes it anew, in one thread
-        at a time. Blocks. Raises what ``make`` raises."""
+        """Returns the value of ``key``. If the value is older than ``age_s`` seconds, ``make`` computes it anew, in one
+        thread at a time. Blocks. Raises what ``make`` raises."""
         with self._lock:
             key_lock = self._locks.setdefault(key, Lock())
         with key_lock:
@@ -95,7 +95,7 @@ class Cache:
 
     def forget(self, *kinds: str) -> None:
         """Drops the values whose key is one of ``kinds``, or is a tuple that begins with one. Values that are being
-        computed are not cached."""
+        computed at that time are not cached."""
         self._forgets += 1
         for key in list(self._values):
             if (key[0] if isinstance(key, tuple) else key) in kinds:
@@ -110,7 +110,7 @@ class Cache:
                 self._locks.pop(key, None)
 
     def clear(self) -> None:
-        """Drops all values, so that each page reads them anew at its next refresh."""
+        """Drops all values, so that each page reads the values anew at its next refresh."""
         with self._lock:
             self._forgets += 1
             self._values.clear()
@@ -121,8 +121,8 @@ shared = Cache()
 
 
 class Page(Element):
-    """Shows one page: a Vue component with the property ``state``. Its event ``act`` carries {name, ...} and runs the
-    action of that name."""
+    """Shows one page: a Vue component with the property ``state``. The component's event ``act`` carries {name, ...}
+    and runs the action of that name."""
 
     actions: Mapping[str, Action] = {}
 
@@ -151,7 +151,7 @@ class Page(Element):
         self._following = ui.timer(FOLLOW_S, self._refresh_followed, active=False, immediate=True)
 
     def look(self) -> Mapping[str, object]:
-        """Returns the document that the page shows. It consists of JSON values. Runs in a thread and may block."""
+        """Returns the document that the page shows, of JSON values. The method runs in a thread and may block."""
         raise NotImplementedError
 
     def preloads(self) -> Iterable[tuple[str, str]]:
@@ -160,8 +160,8 @@ class Page(Element):
         return ()
 
     async def refresh(self) -> None:
-        """Reads the state of the page and sends it to the browser if it differs from the last one. An error is shown
-        once, and the page keeps its last state."""
+        """Reads the state of the page and sends it to the browser if it differs from the last one. If reading fails,
+        the error is shown once, and the page keeps its last state."""
         try:
             async with self._looking:  # what was read before a choice must not be shown after it
                 state = await anyio.to_thread.run_sync(self.look, limiter=_threads, abandon_on_cancel=True)
@@ -188,8 +188,8 @@ class Page(Element):
             self.frame.show(status=status)
 
     def started(self, *jobs: str, opens: bool = False) -> None:
-        """Records jobs that an action has queued, so that this tab of the browser follows them. ``opens``: the head is
-        shown when it is ready."""
+        """Records jobs that an action has queued, so that this tab of the browser follows them. ``opens``: whether the
+        job's head is shown when it is ready."""
         self._started = ([*jobs], opens)
 
     async def _follow(self, event: GenericEventArguments) -> None:
@@ -241,8 +241,8 @@ class Page(Element):
 
 
 def undo(page: Page, event: JsonObject) -> Message:
-    """Undoes a removal that is still waiting, whichever page began it. Raises Gone if it is too late, and Forbidden for
-    a caller who could not have removed the object."""
+    """Undoes a removal that has not been carried out yet, whichever page began it. Raises Gone if the object was
+    already removed, and Forbidden for a caller who could not have removed the object."""
     removal = removals.waiting().get(event["id"])
     if removal is not None:
         permit(page.caller, removal.scope)
@@ -263,8 +263,8 @@ def remove_later(identity: str, remove: Callable[[], None], title: Message, scop
 
 
 def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: Message, scope: str) -> None:
-    """Hides several objects from all pages at once, and removes each after ``UNDO_S`` seconds unless a user undoes the
-    whole removal. Objects that cannot be removed then are logged."""
+    """Hides several objects from all pages at once, and removes each object after ``UNDO_S`` seconds unless a user
+    undoes the whole removal. Objects whose removal fails after the time to undo are logged."""
 
     def remove_each() -> None:
         done = each(ids, remove)
@@ -276,7 +276,7 @@ def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: M
 
 
 def said_unless_refused(said: Message, done: BulkOut) -> Message:
-    """Returns the message about an action on many objects. Raises InvalidInput if some were refused."""
+    """Returns the message about an action on many objects. Raises InvalidInput if some objects were refused."""
     if done.refused:
         faults = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
         raise InvalidInput("some-refused", compose("some-refused", done=said, refused=len(faults)), faults)
@@ -315,7 +315,7 @@ def serve_page(name: str, page: type[Page], *, paths: Sequence[str], choices: Se
 
 
 async def show(name: str, page: type[Page], **initial: str | None) -> RedirectResponse | None:
-    """Shows ``page`` to a caller who is signed in. Others are redirected to the page that asks for an API key."""
+    """Shows ``page`` to a caller who is signed in; redirects other callers to the page that asks for an API key."""
     caller = await signed_in()
     if caller is None:
         return RedirectResponse("/sign-in")
@@ -330,8 +330,8 @@ async def show(name: str, page: type[Page], **initial: str | None) -> RedirectRe
 
 
 def followed_jobs(service: Service, ids: Sequence[str]) -> list[JsonObject]:
-    """Returns the progress of the jobs with these ids, in their order. A removed job has the state ``gone``. All pages
-    share the same answer."""
+    """Returns the progress of the jobs with these ids, in their order. A removed job has the state ``gone``. All open
+    pages share one answer."""
 
     def make() -> list[JsonObject]:
         known = {job.id: job for job in service.jobs.of(ids)}
@@ -370,11 +370,11 @@ def status_of(service: Service, caller: Caller) -> JsonObject | None:
 
 
 def shown_detail(detail: Message) -> Message:
-    """Returns the message of a refusal as a page shows it: without the advice to send a document again."""
+    """Returns the message of a refusal as a page shows it, without the API's advice to send a document again."""
     faults = detail.parameters.get("found")
     return faults if detail.code == "input-unusable" and isinstance(faults, Message) else detail
 
 
 def shown_failure(failure: JobError | None) -> JsonObject | None:
-    """Returns the document of a job's failure as a page shows it; None for None."""
+    """Returns the document of a job's failure as a page shows it; None if the job has not failed."""
     return failure and failure.model_copy(update={"detail": shown_detail(failure.detail)}).model_dump()

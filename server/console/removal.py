@@ -1,8 +1,8 @@
 """Implements removal with undo: an object disappears from the pages at once and is removed a little later, unless a
-user undoes that.
+user undoes the removal.
 
-Waiting removals exist in this process only. If the service ends before, nothing is removed and the object appears
-again, which is the safe outcome.
+Removals that can be undone exist in this process only. If the service ends before a removal, the object appears again,
+which is the safe outcome.
 """
 
 import threading
@@ -20,8 +20,8 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True, slots=True)
 class Removal:
-    """Holds a removal that can still be undone. ``scope``: the scope that a caller needs to undo it; ``ids``:
-    everything that is removed."""
+    """Holds a removal that can still be undone. ``scope``: the scope that a caller needs to undo the removal; ``ids``:
+    all objects that are removed."""
 
     title: Message
     scope: str
@@ -44,8 +44,8 @@ class Removals:
     def add(
         self, identity: str, remove: Callable[[], None], title: Message, scope: str, also: Iterable[str] = ()
     ) -> None:
-        """Adds a removal; ``remove`` is called after ``wait_s`` seconds unless it is undone. ``also``: ids of further
-        objects that ``remove`` removes. Does nothing if the object is already being removed."""
+        """Adds a removal; ``remove`` is called after ``wait_s`` seconds unless the removal is undone. ``also``: ids of
+        further objects that ``remove`` removes. Adds nothing if the object is already being removed."""
         timer = threading.Timer(self.wait_s, self._remove, (identity, remove))
         timer.daemon = True
         with self._lock:
@@ -54,7 +54,7 @@ class Removals:
                 timer.start()
 
     def undo(self, identity: str) -> bool:
-        """Undoes a removal. Returns whether it was still waiting."""
+        """Undoes a removal. Returns whether the removal could still be undone."""
         with self._lock:
             removal = self._waiting.pop(identity, None)
         if removal is not None:

@@ -1,7 +1,7 @@
-"""Draws the live view of the simulated studio, in a child process of its own, so that a shot does not stop it.
+"""Draws the live view of the simulated studio, in a separate child process, so that a shot does not stop the live view.
 
-The studio is drawn once; each picture adds fresh sensor noise only. Cameras use binning, as real ones do for a live
-view, which makes this fast. From time to time one camera is exposed at full size to measure its sharpness.
+The studio is drawn once; each picture adds only new sensor noise. To be fast, the cameras use binning, as real cameras
+do for a live view. From time to time one camera is exposed at full size to measure its sharpness.
 """
 
 from dataclasses import replace

@@ -52,7 +52,7 @@ class Frame(Element, component="static/frame.js"):
             self.update()
 
     def say(self, kind: str, message: Message, faults: Iterable[Message] = ()) -> None:
-        """Shows a message in the corner, with all ``faults``. ``kind``: done, warning or fault."""
+        """Shows a message in the corner, with all ``faults``. ``kind`` is one of "done", "warning" and "fault"."""
         self.run_method("announce", kind, message.document(), documents_of(faults))
 
 

@@ -1,1 +1,1 @@
-"""Implements the HTTP API: routes, their documents, resumable uploads. ``serve`` composes the service."""
+"""Implements the HTTP API: routes, JSON documents of the routes, resumable uploads. ``serve`` composes the service."""

@@ -61,7 +61,7 @@ LINGER_S = 10.0  # a proxy closes within milliseconds of a complete answer; a cl
 
 
 def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None) -> FastAPI:
-    """Builds the service's ASGI app. ``mount_pages`` adds the operator's pages to it. Data folder and database are
+    """Builds the service's ASGI app. ``mount_pages`` adds the operator's pages to the app. Data folder and database are
     opened when the app starts, not when this function is called."""
 
     @asynccontextmanager
@@ -127,7 +127,7 @@ class Watch:
         self._app, self._metrics = app, metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handles one ASGI connection. Only HTTP requests get an id and are counted."""
+        """Handles one ASGI connection; only HTTP requests get an id and are counted."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -157,7 +157,7 @@ class Watch:
 
 class Conditions:
     """Answers HEAD like GET without the content, adds an ETag to resources that can be changed, and refuses a change
-    with 412 if its ``If-Match`` names another state."""
+    with 412 if its ``If-Match`` names another state of the resource."""
 
     def __init__(self, app: ASGIApp, routes: Sequence[APIRoute]) -> None:
         self._app, self._routes = app, routes
@@ -216,8 +216,8 @@ async def _send_start(send: Send, message: Message) -> None:
 async def _repeat(
     service: Service, action: Callable[[], object], every_s: float, fault: str, again_s: float = 0.0
 ) -> None:
-    """Does an action in a thread at once, and then every ``every_s`` seconds. An action that fails, for example because
-    the disk is full or the database is unreachable, is logged as ``fault`` and repeated after ``again_s`` or more."""
+    """Runs an action in a thread at once and every ``every_s`` seconds. An action that fails, for example because the
+    disk is full or the database unreachable, is logged as ``fault`` and repeated after ``again_s`` or more."""
     while True:
         pause_s = every_s
         try:
@@ -238,17 +238,17 @@ async def _measure_lag(metrics: Metrics) -> None:
 
 class JsonBodies:
     """Guards the routes that take a JSON body: identifies the caller, reads at most ``most`` bytes of the body, and
-    passes the request on. It answers bad requests with a problem document: 401 or 403 for the caller, 413 for the size,
-    415 for a form.
+    passes the request on. The class answers bad requests with a problem document: 401 or 403 for the caller, 413 for
+    the size, 415 for a form.
 
-    FastAPI reads the JSON body of a route before it runs the route's dependencies, so a dependency would check the
-    caller too late. Routes that read their body themselves, mainly uploads, are passed through: their dependencies run
-    first, and they have limits of their own."""
+    A FastAPI dependency would check the caller too late, because FastAPI reads a JSON body before it runs dependencies.
+    Requests to routes that read the body themselves, mainly uploads, are passed through: these routes run their
+    dependencies first, and have limits of their own."""
 
     def __init__(
         self, app: ASGIApp, routes: Sequence[APIRoute], most: int = JSON_BYTES, body_s: float = IDLE_TIMEOUT_S
     ) -> None:
-        """Wraps ``app``. ``routes`` are all of its routes in their order."""
+        """Wraps ``app``. ``routes`` are all routes of the app in their order."""
         self._app, self._routes, self._most, self._body_s = app, routes, most, body_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -300,14 +300,14 @@ class JsonBodies:
 class DrainRequestBody:
     """Reads and drops the rest of a request's body when the connection will be closed after the answer.
 
-    The answer begins once the body has ended or after ``patience_s`` seconds. It ends once the body has ended or after
+    The answer begins once the body has ended or after ``patience_s`` seconds, and ends once the body has ended or after
     another ``linger_s`` seconds.
 
-    uvicorn closes a connection that is not kept alive as soon as the answer is sent. Bytes that arrive afterwards reset
-    the connection, and a sender such as nginx loses the answer: its client saw 502 in place of 401 or 422. So this
-    class reads and drops the remaining bytes before the answer ends, as nginx's own lingering_close does. It drops the
-    rest of a short upload before the answer begins: if an answer overtakes the body, nginx closes its client's
-    kept-alive connection, and the client's next request fails.
+    uvicorn closes a connection that is not kept alive as soon as the answer is sent. Bytes that arrive after the
+    connection was closed reset it, and a sender such as nginx loses the answer: its client saw 502 in place of 401 or
+    422. So this class reads and drops the remaining bytes before the answer ends, as nginx's own lingering_close does.
+    The class drops the rest of a short upload before the answer begins: if an answer overtakes the body, nginx closes
+    its client's kept-alive connection, and the client's next request fails.
     """
 
     def __init__(self, app: ASGIApp, *, patience_s: float = PATIENCE_S, linger_s: float = LINGER_S) -> None:
@@ -356,9 +356,9 @@ def _has_body(scope: Scope) -> bool:
 
 
 def describe(app: FastAPI, address: str | None) -> None:
-    """Replaces ``app.openapi`` by a function that returns the completed document: the pipeline's settings get their own
-    schemas, files are marked as bytes, and problem documents replace the framework's errors. ``address``: the service's
-    public address; None: the address of the request."""
+    """Replaces ``app.openapi`` by a function that returns the completed OpenAPI document: the pipeline's settings get
+    their own schemas, files are marked as bytes, and problem documents replace the framework's errors. ``address`` is
+    the service's public address; if it is None, the address of the request is used."""
     original = app.openapi
 
     def openapi() -> JsonObject:
@@ -381,7 +381,7 @@ def _responses(document: JsonObject) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _name_problems(document: JsonObject) -> None:
-    """Replaces the framework's error schemas by that of the problem document."""
+    """Replaces the framework's error schemas by the schema of the problem document."""
     schemas = document.setdefault("components", {}).setdefault("schemas", {})
     schemas["Problem"] = problems.PROBLEM_SCHEMA
     for unused in ("HTTPValidationError", "ValidationError"):
@@ -392,7 +392,7 @@ def _name_problems(document: JsonObject) -> None:
 
 
 def _name_conditions(document: JsonObject) -> None:
-    """Adds ``If-Match`` to the requests that change or remove a resource, and ``ETag`` to those that get it."""
+    """Adds ``If-Match`` to the requests that change or remove a resource, and ``ETag`` to requests that get one."""
     text = {"schema": {"type": "string"}}
     tag = {"description": "of this state; If-Match takes it", **text}
     for path in document["paths"].values():

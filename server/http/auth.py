@@ -1,7 +1,7 @@
 """Identifies the caller of a request by the API key in its Authorization header.
 
-On a loopback address, while no key exists, everybody on this machine is a caller with all scopes. Requests that a
-foreign web page makes a browser send are then refused by their Host and Origin headers.
+On a loopback address, while no key exists, everybody on this machine is a caller with all scopes. While no key exists,
+requests that a foreign web page makes a browser send are refused by their Host and Origin headers.
 """
 
 import asyncio
@@ -39,10 +39,10 @@ ServiceOf = Annotated[Service, Depends(service_of)]
 
 def require(scope: str) -> Callable[..., Caller]:
     """Returns a FastAPI dependency that yields the caller, or raises a 401 problem for an unknown caller and a 403
-    problem for one without ``scope``.
+    problem for a caller without ``scope``.
 
-    It runs before an upload is read. FastAPI reads JSON bodies before dependencies, so routes with such a body are
-    guarded by ``check_caller`` (``JsonBodies`` of server.http.app).
+    The dependency runs before an upload is read. FastAPI reads JSON bodies before it runs dependencies, so
+    ``check_caller`` (in ``JsonBodies`` of server.http.app) guards the routes with a JSON body.
     """
 
     def authenticate(
@@ -97,12 +97,12 @@ def _check_origin(request: Request) -> None:
 
 class FairShares:
     """Serves the requests of each caller one by one, so that thousands of requests delay another caller by only one.
-    Parallel requests would be slower, because of Python's lock (2,000 took 13.1 s two at once, 7.8 one by one).
+    Parallel requests would be slower, because of Python's lock: 2,000 requests took 13.1 s in pairs and 7.8 s singly.
 
-    A caller is identified by the API key after it was accepted, and by the network address before. The next request
-    begins when the answer of the previous one begins, when that waits for a long body, or after ``SLOW_S`` seconds if
-    fewer than ``SLOW_MOST`` requests were that slow. A caller whose streams, slow downloads and uploads use the
-    fraction ``SHARE`` of all connections gets no more (429).
+    A caller is identified by the network address until an API key was accepted, and by this key afterwards. A caller's
+    next request begins when the answer to the previous request begins, when the previous request waits for a long body,
+    or after ``SLOW_S`` seconds if fewer than ``SLOW_MOST`` requests were that slow. A caller whose streams, slow
+    downloads and uploads use the fraction ``SHARE`` of all connections gets no further connection (429).
     """
 
     def __init__(self, app: ASGIApp) -> None:

@@ -1,9 +1,9 @@
 """Limits the cost of a connection before the caller has shown an API key: bytes and seconds of a header, the pace of a
 body, the client's pace of reading, and the number of connections.
 
-uvicorn's parser, httptools, takes quadratic time for a header in many pieces and limits neither its size nor its time.
-h11 limits only the size, at 139 us of CPU for each request against 60 us. So bytes are counted here, in front of the
-parser. A connection that exceeds its time is closed; a header that is too long gets an error answer.
+uvicorn's parser, httptools, takes quadratic time for a header in many pieces and limits neither the header's size nor
+its time; the parser h11 limits only the size, and takes 139 us of CPU for a request instead of 60 us. So this module
+counts bytes before the parser. A connection that exceeds a time limit is closed; a header too long gets an error.
 """
 
 import resource
@@ -29,9 +29,9 @@ PIPELINED_MOST = 16  # requests that wait behind the one that is answered
 class BoundedConnection(HttpToolsProtocol):
     """Serves a connection, as uvicorn does, within the limits of this module.
 
-    If there are too many connections, or one address has more than half of them, an idle one is closed for a new one:
-    from the address with the most connections, the one that has waited longest for a header. If no connection is idle,
-    the new one is closed.
+    If there are too many connections, or one address has more than half of them, an idle connection is closed for a new
+    one: of the address with the most connections, the connection that has waited longest for a header. If no connection
+    is idle, the new connection is closed.
     """
 
     _timer: TimerHandle | None = None
@@ -40,7 +40,7 @@ class BoundedConnection(HttpToolsProtocol):
     _unparsed = _received = 0
 
     def connection_made(self, transport: BaseTransport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Accepts a new connection, or closes it or an idle one if there are too many."""
+        """Accepts a new connection; if there are too many, closes an idle connection or the new one."""
         super().connection_made(cast(Transport, transport))
         self.since = self.loop.time()
         self._await_header()
@@ -56,7 +56,7 @@ class BoundedConnection(HttpToolsProtocol):
         return self._in_header and (self.cycle is None or self.cycle.response_complete)
 
     def drop(self) -> None:
-        """Closes the connection at once and forgets it."""
+        """Closes the connection at once and no longer counts it."""
         self.connections.discard(self)
         self.transport.abort()
 
@@ -120,14 +120,14 @@ class BoundedConnection(HttpToolsProtocol):
 
     @property
     def host(self) -> str:
-        """Returns the address that the connection comes from; empty if there is none."""
+        """Returns the address from which the connection comes; an empty text if the address is unknown."""
         return self.client[0] if self.client else ""
 
     def _await_header(self) -> None:
         self._set_timer(self.loop.call_later(HEADER_S, self.drop))
 
     def _keep_pace(self) -> None:
-        """Checks after ``PACE_S`` seconds that the body made progress, unless this side did not read meanwhile."""
+        """Checks after ``PACE_S`` seconds that more of the body has arrived, unless the service did not read."""
         before = self._received
 
         def check() -> None:

@@ -1,5 +1,5 @@
 """Defines HTTP documents: requests about captures, sessions, jobs, the rig and calibrations, and the answers for
-captures, results and lists, which no service defines."""
+captures, results and lists."""
 
 import base64
 import binascii
@@ -37,7 +37,7 @@ class WarningOut(MessageOut):
 
 
 class Received(BaseModel):
-    """Refuses unknown keys; it is the base of all request bodies."""
+    """Refuses unknown keys, as the base class of all request bodies."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -85,7 +85,7 @@ class NewImport(Received):
 
 
 class SessionEdit(Received):
-    """Changes the label or the consent note of a session. Keys that are left out keep their values."""
+    """Changes the label or the consent note of a session. Keys that the request leaves out keep their values."""
 
     model_config = example({"label": "Anna B."})
 
@@ -94,8 +94,8 @@ class SessionEdit(Received):
 
 
 class CaptureEdit(Received):
-    """Changes a capture. Keys that are left out keep their values; ``"session": null`` removes the capture from its
-    session."""
+    """Changes a capture. Keys that the request leaves out keep their values; ``"session": null`` removes the capture
+    from its session."""
 
     model_config = example({"expression": "smile"})
 
@@ -169,7 +169,7 @@ class NewSessionJobs(Received):
 
 
 class Restart(Received):
-    """Repeats a job. Keys that are left out have the values of the old job."""
+    """Repeats a job. Keys that the request leaves out have the old job's values."""
 
     model_config = example({"settings": {"method": "simplex"}})
 
@@ -326,8 +326,8 @@ class NewDelivery(Received):
 
 
 class CameraSettingsEdit(Received):
-    """Changes a camera's settings. A key that is left out keeps its value. With null the service no longer sets the
-    value, and the camera keeps its current one."""
+    """Changes a camera's settings. A key that the request leaves out keeps its value. For a key that is null the
+    service no longer sets a value, and the camera keeps its current value."""
 
     model_config = example({"exposure_ms": 8.0, "gain_db": 0.0})
 
@@ -347,13 +347,13 @@ class Lights(Received):
 
 
 class CaptureChecks(Answer):
-    """Holds the measurements of each camera's picture, by camera. It is empty for captures of earlier versions."""
+    """Holds the measurements of each camera's picture, by camera; empty for captures of earlier versions."""
 
     cameras: dict[str, ViewChecksOut]
 
 
 class PlatesOut(Answer):
-    """Describes a version of the clean plates that is stored."""
+    """Describes a stored version of the clean plates."""
 
     id: str
     taken: Moment
@@ -378,7 +378,7 @@ class UsePlates(Received):
 
 
 class BackgroundOut(Answer):
-    """Describes the clean plates that were just taken: the cameras, and how many pictures of each."""
+    """Describes the clean plates that were just taken: the cameras, and how many pictures each camera took."""
 
     cameras: list[str]
     plates: int
@@ -387,7 +387,7 @@ class BackgroundOut(Answer):
 
 
 class NewCalibration(Received):
-    """Requests a calibration from shots by the rig, of the board or of any scene."""
+    """Requests a calibration from the rig's shots of the calibration board or of any scene."""
 
     model_config = example(
         {"board": {"kind": "charuco", "columns": 12, "rows": 9, "square_mm": 30.0}, "captures": [EXAMPLE_ID]},

@@ -32,7 +32,7 @@ class WorkerProcess:
     """Keeps a worker process running as long as this process lives.
 
     A worker that dies is started again, after a pause that grows with each early death. The worker ends when its
-    standard input closes, so also if this process is killed.
+    standard input closes, and therefore also if this process is killed.
     """
 
     def __init__(self, settings: ServiceSettings) -> None:
@@ -43,8 +43,8 @@ class WorkerProcess:
         self._thread.start()
 
     def expect_end(self) -> None:
-        """Stops restarting the worker. Call it when this process is asked to end: the signal may have gone to the whole
-        process group or container and then also ends the worker."""
+        """Stops restarting the worker. Callers call the method when a signal ends this process, because the signal may
+        have gone to the whole process group or container and may also end the worker."""
         self._stop.set()
 
     def close(self) -> None:
@@ -87,11 +87,11 @@ class WorkerProcess:
 
 
 def run_service(settings: ServiceSettings, *, worker: bool = True, ready: Callable[[str], None] | None = None) -> None:
-    """Serves requests until a signal ends the process. ``ready`` is called with the service's address once it answers.
+    """Serves requests until a signal ends the process. Calls ``ready`` with the address once the service answers.
 
     Faults of the rig's file, the address and the database are reported before heavy modules are loaded. Raises
-    InputError for the rig's file, AddressTaken, DatabaseUnavailable, and KeylessAddress if others could reach a service
-    without keys.
+    InputError for the rig's file, AddressTaken, DatabaseUnavailable, and KeylessAddress if other machines could reach a
+    service without keys.
     """
     if settings.rig is not None:
         read_rig_config(settings.rig)

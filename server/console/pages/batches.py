@@ -26,7 +26,7 @@ class BatchesPage(Page, component="batches.js"):
 
     def look(self) -> JsonObject:
         """Returns the state of the page: one page of the list, and the selected batch (even if it is on another page)
-        with its newest failed jobs. ``parquet``: whether Parquet tables can be made."""
+        with its newest failed jobs. ``parquet``: whether this machine can make Parquet tables."""
         requested = {name: self.choice.get(name) or None for name in ASKED}
         state: JsonObject = shared.get(
             ("batches", *requested.values()), 0.5, lambda: batches_state(self.service, requested)
@@ -49,8 +49,8 @@ def batches_state(service: Service, requested: Mapping[str, str | None]) -> Json
 
 
 def failed_jobs(service: Service, batch: str) -> list[JsonObject]:
-    """Returns the newest ``FAILED_SHOWN`` failed jobs of a batch, each with the label of its capture and ``why``: every
-    fault, or the one reason."""
+    """Returns the newest ``FAILED_SHOWN`` failed jobs of a batch, each with the label of its capture and, in ``why``,
+    every fault or the one reason."""
 
     def make() -> list[JsonObject]:
         failed = service.jobs.page(JobQuery("", STATUSES["failed"], batch=batch), FAILED_SHOWN).items
@@ -68,8 +68,8 @@ def failed_jobs(service: Service, batch: str) -> list[JsonObject]:
 
 
 def begin(page: Page, event: JsonObject) -> Message:
-    """Begins a batch of the captures whose labels begin with ``prefix``, and selects it. ``detail`` is empty for the
-    default. Raises what ``Batches.submit`` raises."""
+    """Begins a batch of the captures whose labels begin with ``prefix``, and selects it. An empty ``detail`` means the
+    default level of detail. Raises what ``Batches.submit`` raises."""
     settings = {"detail": event["detail"]} if event["detail"] else {}
     wanted = BatchRequest(ReconstructionRequest(None, settings), prefix=event["prefix"], label=event["label"])
     batch = page.service.batches.submit(wanted, key=page.caller.key)
@@ -79,8 +79,8 @@ def begin(page: Page, event: JsonObject) -> Message:
 
 
 def changes(change: Callable[[Service, str], object]) -> Callable[[Page, JsonObject], None]:
-    """Makes the function of an action that changes a batch and refreshes the lists. ``change`` gets the service and the
-    batch's id."""
+    """Makes the function of an action that changes a batch and refreshes the lists. The function ``change`` gets the
+    service and the batch's id."""
 
     def act(page: Page, event: JsonObject) -> None:
         change(page.service, event["id"])

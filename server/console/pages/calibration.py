@@ -21,8 +21,8 @@ NO_BOARD = compose("studio-without-board")
 
 
 class Shots:
-    """Collects shots of the board for a calibration. There is one collection in a service process, which all pages
-    show; a restart empties it. Thread-safe."""
+    """Collects shots of the board for a calibration. A service process has one collection of shots, which all pages
+    show; a restart empties the collection. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -65,13 +65,13 @@ class CalibrationPage(Page, component="calibration.js"):
 
 
 def known_calibrations(service: Service, age_s: float) -> list[CalibrationOut]:
-    """Returns all calibrations, newest first. The list is shared by the pages and at most ``age_s`` seconds old."""
+    """Returns all calibrations, newest first. The pages share the list, which is at most ``age_s`` seconds old."""
     return shared.get("calibrations", age_s, service.calibrations.find)
 
 
 def calibration_state(service: Service) -> JsonObject:
     """Returns what the page shows: calibrations, rig, and the coverage of the board's shots so far with advice for the
-    next one. ``is_measured``: a calibration that this service made is in use."""
+    next shot. ``is_measured``: whether a calibration that this service made is in use."""
     rig = service.rig.describe()
     names = [camera.name for camera in rig.cameras]
     lines = summary(names, [corners for _, corners in shots.taken])
@@ -108,8 +108,8 @@ def board_of(event: JsonObject) -> Mapping[str, object]:
 def shoot(page: Page, event: JsonObject) -> Message:
     """Takes a shot of the board and adds it to the collection. A shot in which no camera sees the board is removed.
 
-    Raises InputError for an impossible board, Conflict if the collection shows a different one, InvalidInput if no
-    camera sees it, and what ``Captures.take`` raises.
+    Raises InputError for an impossible board, Conflict if earlier shots show a different board, InvalidInput if no
+    camera sees the board, and what ``Captures.take`` raises.
     """
     from calibration.board.board import board_from_document
 
@@ -156,8 +156,8 @@ def calibrate(page: Page, event: JsonObject) -> Message:
 
 
 def use(page: Page, event: JsonObject) -> Message:
-    """Selects a calibration for every later capture; with ``poor`` even one with the verdict poor, whose faults the
-    operator has read. Raises NotFound, and Conflict as ``Service.use_calibration`` does."""
+    """Selects a calibration for every later capture; with ``poor`` even a calibration with the verdict poor, whose
+    faults the operator has read. Raises NotFound and Conflict as ``Service.use_calibration`` does."""
     page.service.use_calibration(event["id"], poor=event.get("poor", False))
     _forget()
     return compose("calibration-taken-into-use")

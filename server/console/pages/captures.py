@@ -1,7 +1,7 @@
 """Implements the page Captures: the list, uploads, outlines over the images, starting jobs, and removal with undo.
 
-The values of its form become a job request here. A preset is a named choice of a job's settings; for other settings the
-user writes a settings document."""
+The module converts the values of the page's form to a job request. A preset is a named choice of a job's settings; for
+other settings the user writes a settings document."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -34,8 +34,8 @@ SESSIONS_SHOWN = 200  # newest ones, in lists to choose from; older ones are fou
 
 
 def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JsonObject]]:
-    """Returns the jobs of each capture, newest first, with the progress (0 to 1) of those that run. Jobs whose removal
-    waits are left out."""
+    """Returns the jobs of each capture, newest first, with the progress (0 to 1) of running jobs. Jobs that are being
+    removed are left out."""
     found = service.jobs.of_captures(captures)
     running = [job for jobs in found.values() for job, state in jobs if state == "running"]
     progress = {job.id: job.progress for job in service.jobs.of(running)}
@@ -49,7 +49,7 @@ def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JsonObj
 
 def capture_line(record: CaptureRecord, jobs: list[JsonObject]) -> JsonObject:
     """Converts a capture's record to an entry of a list. ``jobs``: the capture's jobs, as ``jobs_of`` returns them;
-    ``size``: of the first camera's pictures (px); ``sizes``: width and height by camera."""
+    ``size``: size of the first camera's pictures (px); ``sizes``: width and height by camera."""
     return {
         **{name: getattr(record, name) for name in OF_RECORD},
         "cameras": [camera.name for camera in record.cameras],
@@ -64,8 +64,8 @@ def capture_line(record: CaptureRecord, jobs: list[JsonObject]) -> JsonObject:
 
 
 def sync_line(shot: Mapping[str, object]) -> JsonObject:
-    """Writes a sentence on the time differences of a shot's pictures, with ``good`` if they are small. ``shot`` is its
-    certificate."""
+    """Writes a sentence on the time differences of a shot's pictures, with ``good`` if the differences are small.
+    ``shot`` is its certificate."""
     lines = sync_of(shot)
     late = sorted(name for name, line in lines.items() if line["status"] not in ("in sync", "recorded"))
     if late:
@@ -97,7 +97,7 @@ def sessions_list(service: Service, chosen: str | None = None) -> list[JsonObjec
 
 
 def session_line(session: SessionOut) -> JsonObject:
-    """Converts a session to an entry of a list. ``captures`` is their number, without captures whose removal waits."""
+    """Converts a session to an entry of a list. ``captures`` counts the captures that are not being removed."""
     return session.model_dump() | {"captures": sum(capture not in removals for capture in session.captures)}
 
 
@@ -135,7 +135,7 @@ PRESETS = (
 
 
 def settings_of(preset: str | None) -> Mapping[str, object]:
-    """Returns the settings of the preset with this id. None and an unknown id select the preset Standard."""
+    """Returns the settings of the preset with this id. None or an unknown ``preset`` selects the preset Standard."""
     return next((known.settings for known in PRESETS if known.id == (preset or "")), {})
 
 
@@ -153,7 +153,7 @@ def template_lines() -> list[JsonObject]:
 
 def chosen_work(event: JsonObject) -> ReconstructionRequest:
     """Returns the request that a form describes: model, preset (``method``) and template. Values that the form leaves
-    out get the service's defaults."""
+    out get the service's default values."""
     settings, template = dict(settings_of(event.get("method"))), event.get("template")
     if template:
         settings["outputs"] = cast(dict[str, object], settings.get("outputs", {})) | {"template": template}
@@ -176,8 +176,8 @@ class CapturesPage(Page, component="captures.js"):
 
 
 def captures_state(service: Service, requested: Mapping[str, str | None]) -> JsonObject:
-    """Returns one page of the captures that match what is requested, each with its jobs. Captures whose removal waits
-    are left out. ``chosen``: the selected capture, even if it is on another page of the list."""
+    """Returns one page of the captures that match the request, each with its jobs. Captures that are being removed are
+    left out. ``chosen``: the selected capture, even if it is on another page of the list."""
     order = cast(CaptureOrder, requested["sort"] if requested["sort"] in get_args(CaptureOrder) else "-created")
     query = CaptureQuery(
         requested["find"] or "", requested["session"], requested["verdict"], tag=requested["tag"], order=order
@@ -201,7 +201,7 @@ def captures_state(service: Service, requested: Mapping[str, str | None]) -> Jso
 
 
 def reconstruct(page: Page, event: JsonObject) -> Message:
-    """Queues a job for a capture; its head opens when it is ready. Raises what ``Jobs.submit`` raises."""
+    """Queues a job for a capture; the page shows the head when it is ready. Raises what ``Jobs.submit`` raises."""
     job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
     page.started(job.id, opens=True)
     return compose("job-queued-watch", job=job.id[-6:])
@@ -224,8 +224,8 @@ def sample(page: Page, event: object) -> Message:
 
 
 def edit(page: Page, event: JsonObject) -> None:
-    """Changes label, expression, session or tags (separated by commas) of a capture; fields missing from the form stay.
-    Raises NotFound and InputError."""
+    """Changes label, expression, session or tags (separated by commas) of a capture; fields that the form does not
+    contain keep their values. Raises NotFound and InputError."""
     changes: dict[str, str | None] = {k: event.get(k) for k in ("label", "expression", "session") if k in event}
     tags = typed_tags(event["tags"]) if "tags" in event else None
     page.service.captures.edit(event["id"], changes, tags=tags)
@@ -233,7 +233,7 @@ def edit(page: Page, event: JsonObject) -> None:
 
 
 def new_session(page: Page, event: JsonObject) -> Message:
-    """Makes a session. Raises InputError for invalid texts."""
+    """Makes a session. Raises InputError if its label or consent note is invalid."""
     session = page.service.sessions.add(event.get("label", ""), event.get("consent", ""))
     forget_captures()
     return compose("session-begun", name=session.label or session.id[-6:])
@@ -261,8 +261,8 @@ def erase_capture(page: Page, event: JsonObject) -> Message:
 
 
 def discard(page: Page, event: JsonObject) -> None:
-    """Removes a capture after the time to undo has passed; the message states how many heads stay. Raises NotFound, and
-    Conflict while a queued or running job needs it."""
+    """Removes a capture after the time to undo has passed; a message states how many heads stay. Raises NotFound, and
+    Conflict while a queued or running job needs the capture."""
     service, identity = page.service, event["id"]
     record = service.captures.check_unused(identity)
     heads = len(service.captures.holdings(identity).heads)
@@ -273,8 +273,8 @@ def discard(page: Page, event: JsonObject) -> None:
 
 
 def bulk(page: Page, event: JsonObject) -> Message | None:
-    """Applies one ``action`` to all ticked captures, ``ids``. ``id``: the session to move them to, empty for none. If
-    it is refused for some captures, it is applied to the others, and InvalidInput is raised with the reasons."""
+    """Applies one ``action`` to all ticked captures, ``ids``. ``id``: the session to move the captures to, or empty. An
+    action that is refused for some captures is applied to the others, and raises InvalidInput with the reasons."""
     service, ids, action = page.service, event["ids"], event["action"]
     if action == "reconstruct":
         permit(page.caller, "submit")
@@ -317,7 +317,7 @@ def said_of(action: str, count: int) -> Message:
 
 
 def forget_captures() -> None:
-    """Drops what is cached of captures, sessions, tags and subjects."""
+    """Drops the cached values about captures, sessions, tags and subjects."""
     shared.forget("captures", "sessions", "tags", "subjects", "rig")
 
 

@@ -1,6 +1,6 @@
 """Implements the page Features, where the operator picks the paper's seven points (section 4.2) and others in views.
 
-This step is optional: without points the pipeline finds the alignment itself.
+Picking is optional: without points the pipeline finds the alignment itself.
 """
 
 import threading
@@ -45,15 +45,15 @@ class Picked:
 
 
 class Drafts:
-    """Keeps unsaved points for each operator and capture, so that a reload of the page shows them again. They are lost
-    when the process ends."""
+    """Keeps unsaved points for each operator and capture, so that a reload of the page shows them again. Unsaved points
+    are lost when the process ends."""
 
     def __init__(self, most: int = 200) -> None:
         self._most, self._kept = most, OrderedDict[tuple[str, str], Points]()
 
     def keep(self, caller: str, picked: Picked) -> None:
-        """Stores the points of a page for a caller, or drops the draft if all points are saved. Beyond the limit the
-        oldest drafts are dropped."""
+        """Stores the points of a page for a caller, or drops the draft if all points are saved. If there are too many
+        drafts, the oldest drafts are dropped."""
         self._kept.pop((caller, picked.capture), None)
         if picked.points != picked.saved:
             self._kept[caller, picked.capture] = picked.points
@@ -61,7 +61,7 @@ class Drafts:
                 self._kept.popitem(last=False)
 
     def of(self, caller: str, capture: str) -> Points | None:
-        """Returns the draft of a caller for a capture; None if there is none."""
+        """Returns a caller's unsaved points for a capture; None if there are none."""
         return self._kept.get((caller, capture))
 
 
@@ -75,7 +75,7 @@ class FeaturesPage(Page, component="features.js"):
     picked: Picked | None = None
 
     def look(self) -> JsonObject:
-        """Returns the captures to choose from, and the points of the chosen one with the aids for picking more."""
+        """Returns the captures to choose from, and the points of the chosen capture with the aids for picking more."""
         captures: list[JsonObject] = shared.get("choices", 2.0, lambda: captures_to_pick(self.service))
         chosen = self.choice.get("capture") or (captures[0]["id"] if captures else None)
         known = any(capture["id"] == chosen for capture in captures)
@@ -138,8 +138,8 @@ def choice_of(record: CaptureRecord) -> JsonObject:
 
 
 class Landmarks:
-    """Holds the landmarks of the default model's mean head (head frame, mm). They are loaded in a thread, which takes a
-    second or more; until then there are none."""
+    """Holds the landmarks of the default model's mean head (head frame, mm). The landmarks are loaded in a thread,
+    which takes a second or more; until then none are known."""
 
     def __init__(self) -> None:
         self._asked = threading.Lock()
@@ -164,7 +164,7 @@ landmarks = Landmarks()
 
 
 def place(page: FeaturesPage, event: JsonObject) -> None:
-    """Sets one ``point`` in the view of one ``camera``, or removes it there if ``at`` is None. Saves nothing yet."""
+    """Sets one ``point`` in the view of one ``camera``, or removes it if ``at`` is None. Saves nothing yet."""
     picked = page.of_capture()
     points = {name: dict(views) for name, views in picked.points.items()}
     views = points.setdefault(event["point"], {})
@@ -179,7 +179,7 @@ def place(page: FeaturesPage, event: JsonObject) -> None:
 
 def suggest(page: FeaturesPage, event: object) -> Message:
     """Suggests all seven points in every view that shows the face. Suggestions are neither saved nor used until the
-    user accepts them. Raises InvalidInput if no face is certain, and what ``found_faces`` raises."""
+    user accepts them. Raises InvalidInput if no face is found with certainty, and what ``found_faces`` raises."""
     picked = page.of_capture()
     suggested = found_faces(page.service, picked.capture)["suggested"]
     if not suggested:
@@ -189,8 +189,8 @@ def suggest(page: FeaturesPage, event: object) -> Message:
 
 
 def accept(page: FeaturesPage, event: JsonObject) -> None:
-    """Turns suggestions into points: of one ``point`` in one ``camera``, of one point, or all. They are saved like all
-    others."""
+    """Turns suggestions into points: of one ``point`` in one ``camera``, of one point in all cameras, or of all points.
+    Accepted points are saved like all other points."""
     picked = page.of_capture()
     picked.points = take_suggestions(picked.points, picked.suggested, event.get("point"), event.get("camera"))
     picked.suggested = open_suggestions(picked.suggested, picked.points)
@@ -198,14 +198,14 @@ def accept(page: FeaturesPage, event: JsonObject) -> None:
 
 
 def reject(page: FeaturesPage, event: JsonObject) -> None:
-    """Drops the selected suggestions without setting points."""
+    """Drops the selected suggestions of points without setting the points."""
     picked = page.of_capture()
     picked.suggested = drop_suggestions(picked.suggested, event.get("point"), event.get("camera"))
 
 
 def save(page: FeaturesPage, event: JsonObject) -> Message | None:
-    """Stores the points of the page. If views contradict each other, it stores nothing and returns None until the user
-    confirms (event with ``sure``). Raises what ``Captures.put_features`` raises."""
+    """Stores the points of the page. If views contradict each other, the function stores nothing and returns None until
+    the user confirms (``sure`` in the event). Raises what ``Captures.put_features`` raises."""
     picked = page.of_capture()
     points = picked.points
     if not event.get("sure") and contradictions(page):
@@ -225,8 +225,8 @@ def contradictions(page: FeaturesPage) -> Mapping[str, MessageDocument]:
 
 
 def reconstruct(page: FeaturesPage, event: JsonObject) -> Message | None:
-    """Saves the points if needed, and queues a job for the capture. Returns None without a job if contradictions must
-    be confirmed first."""
+    """Saves the points if needed, and queues a job for the capture. If the user must confirm contradictions first, no
+    job is queued and the function returns None."""
     picked = page.of_capture()
     if picked.points != picked.saved and save(page, event) is None:
         return None
@@ -262,7 +262,7 @@ def take_suggestions(
     points: PixelsOfPoints, suggested: PixelsOfPoints, point: str | None = None, camera: str | None = None
 ) -> PixelsOfPoints:
     """Returns the points with suggestions added: those of ``point`` in the view ``camera``, of ``point`` in all views
-    if ``camera`` is None, or all if both are None. Points that are set already stay."""
+    if ``camera`` is None, or all if both are None. Points that are set already keep their pixels."""
     taken = {name: dict(views) for name, views in points.items()}
     for name, view, at in _of(open_suggestions(suggested, points), point, camera):
         taken.setdefault(name, {})[view] = at

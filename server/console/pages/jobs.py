@@ -78,8 +78,8 @@ def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JsonObj
 
 
 def active_jobs(service: Service, sought: str, batch: str | None, *, running: bool = True) -> tuple[list[JobOut], int]:
-    """Returns the running jobs and the next ones, ``SHOWN`` at most, and how many more wait. ``running``: whether to
-    include running jobs."""
+    """Returns at most ``SHOWN`` jobs, the running ones and then the next waiting ones, and the number of further
+    waiting jobs. With ``running`` the list includes the running jobs."""
     query = JobQuery(sought, ACTIVE if running else STATUSES["queued"], batch=batch)
     matching = service.jobs.page(query, SOUGHT_MOST)
     jobs = sorted(matching.items, key=lambda job: (job.state != "running", job.ahead or 0, job.id))
@@ -87,7 +87,7 @@ def active_jobs(service: Service, sought: str, batch: str | None, *, running: bo
 
 
 def capture_of(service: Service, job: JobOut) -> JsonObject:
-    """Returns label (``capture``), time (``captured``) and session of a job's capture, as far as that exists."""
+    """Returns label (``capture``), time (``captured``) and session of a job's capture, as far as the capture exists."""
     for record in service.captures.of([job.capture_id or ""]):
         return {"capture": record.label, "captured": record.created, "session": record.session}
     return {"capture": "", "captured": None, "session": job.session}
@@ -101,7 +101,7 @@ def job_line(service: Service, job: JobOut) -> JsonObject:
 
 def job_detail(service: Service, job_id: str) -> JsonObject:
     """Returns the log of a job and, once it has finished, the report of each camera, the warnings, and whether there
-    are pictures. After the job has finished they are cached for an hour. Raises NotFound."""
+    are pictures. After the job has finished, these values are cached for an hour. Raises NotFound."""
     finished = service.jobs.state(job_id) in FINISHED
 
     def make() -> JsonObject:
@@ -133,7 +133,7 @@ def log_lines(events: list[JobEvent]) -> list[JsonObject]:
 
 
 def restart(page: Page, event: JsonObject) -> Message:
-    """Queues a new job for the capture of an earlier one, and selects it. Raises what ``Jobs.restart`` raises."""
+    """Queues and selects a new job for the capture of an earlier job. Raises what ``Jobs.restart`` raises."""
     wanted = ReconstructionRequest(event.get("model") or None, chosen_settings(event))
     job = page.service.jobs.restart(event["id"], wanted, key=page.caller.key)
     page.choice["job"] = job.id
@@ -143,7 +143,7 @@ def restart(page: Page, event: JsonObject) -> Message:
 
 def chosen_settings(event: JsonObject) -> Mapping[str, object]:
     """Reads the settings of a form: method, detail, front, and further ones from the JSON text ``more``. Raises
-    InputError if that text is no JSON object."""
+    InputError if ``more`` is no JSON object."""
     try:
         settings = json.loads(event.get("more") or "{}")
     except ValueError as error:
@@ -154,7 +154,7 @@ def chosen_settings(event: JsonObject) -> Mapping[str, object]:
 
 
 def cancel(page: Page, event: JsonObject) -> None:
-    """Cancels a job. A finished one stays as it is. Raises NotFound."""
+    """Cancels a job. A finished job stays as it is. Raises NotFound."""
     page.service.cancel(event["id"])
 
 
@@ -166,9 +166,9 @@ def delete(page: Page, event: JsonObject) -> None:
 
 
 def bulk(page: Page, event: JsonObject) -> Message:
-    """Applies one ``action`` (cancel, restart, remove) to all ticked jobs, ``ids``. If it is refused for some jobs, it
-    is applied to the others, and InvalidInput is raised with the reasons. Raises Conflict if all jobs to be removed are
-    still active."""
+    """Applies one ``action`` (cancel, restart, remove) to all ticked jobs, ``ids``. If the action is refused for some
+    jobs, it is applied to the others, and InvalidInput is raised with the reasons. Raises Conflict if all jobs to be
+    removed are still active."""
     service, action = page.service, event["action"]
     if action == "remove":
         ended = [job.id for job in service.jobs.of(event["ids"]) if job.state in FINISHED]

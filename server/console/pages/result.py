@@ -29,8 +29,8 @@ class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS
     """Shows one head in 3D with its figures, and the heads to choose from."""
 
     def look(self) -> JsonObject:
-        """Returns the shown head, which stays when new heads arrive, and the heads to choose from: the newest that
-        match the search, and those of the same subject. ``total`` is the number of matches."""
+        """Returns the shown head, which stays when new heads arrive, and the heads to choose from: the newest heads
+        that match the search, and the heads of the same subject. ``total`` counts the heads that match."""
         sought, chosen = self.choice.get("find") or "", self.choice.get("job")
         results, total = shared.get(("results", sought), 1.0, lambda: newest_heads(self.service, sought))
         if chosen is None:
@@ -62,7 +62,7 @@ class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS
 
 
 def newest_heads(service: Service, sought: str) -> tuple[list[JsonObject], int]:
-    """Returns the newest ``SHOWN`` succeeded jobs that match a search, and how many match in all."""
+    """Returns the newest ``SHOWN`` succeeded jobs that match a search, and the total number of jobs that match."""
     page = service.jobs.page(JobQuery(sought, STATUSES["succeeded"]), SHOWN)
     return result_lines(service, [job for job in page.items if job.id not in removals]), page.total
 
@@ -91,9 +91,9 @@ def result_lines(service: Service, jobs: Iterable[JobOut]) -> list[JsonObject]:
 
 
 def head_of(service: Service, job: JsonObject) -> JsonObject:
-    """Returns what is shown beside a head, from its report.json; values are empty or None if that is missing.
-    ``clear_views``: how many views see most of the rim, ``contour_px``: their mean residual (px); ``truth``: whether
-    the true head is known; ``files``: size of each file (bytes). Raises NotFound."""
+    """Returns what is shown beside a head, from its report.json; values are empty or None if report.json is missing.
+    ``clear_views``: how many views see most of the rim; ``contour_px``: the mean residual of these views (px);
+    ``truth``: whether the true head is known; ``files``: size of each file (bytes). Raises NotFound."""
     report = read_report(service, job["id"])
     truth = service.store.folder("captures", job["capture_id"] or "") / "truth" / "head.ply"
     residuals = [] if report is None else clear_residuals(report)
@@ -115,8 +115,8 @@ def head_of(service: Service, job: JsonObject) -> JsonObject:
 
 
 def clear_residuals(report: Report) -> list[float]:
-    """Returns the contour residuals (px) of the cameras that see most of the rim. Residuals of other cameras are caused
-    by hair and clothes."""
+    """Returns the contour residuals (px) of the cameras that see most of the rim. In other cameras hair and clothes
+    cause the contour residuals."""
     cameras = [camera for camera in report.get("cameras", {}).values() if camera.get("used")]
     clear = [camera for camera in cameras if (camera.get("excluded_share") or 0.0) < MOSTLY]
     residuals = [camera.get("contour_rms_px") for camera in clear]

@@ -40,8 +40,8 @@ class RigPage(Page, component="rig.js"):
 
 
 def job_strip(service: Service, identity: str | None) -> JsonObject | None:
-    """Returns the shown fields of a job, with ``detail``: why it failed or cannot begin. Returns None if there is none
-    or it is being removed."""
+    """Returns the shown fields of a job, with ``detail``: why the job failed or cannot begin. Returns None if there is
+    no such job or it is being removed."""
     jobs = service.jobs.of([identity]) if identity is not None and identity not in removals else []
     if not jobs:
         return None
@@ -52,7 +52,7 @@ def job_strip(service: Service, identity: str | None) -> JsonObject | None:
 
 
 def shot_taken(service: Service, identity: str | None) -> JsonObject | None:
-    """Returns the capture that awaits the operator's decision to keep it; None if there is none or it was removed."""
+    """Returns the capture that awaits the operator's decision to keep it; None if no capture does or it was removed."""
     if identity is None or identity in removals:
         return None
     with suppress(NotFound):
@@ -85,8 +85,8 @@ def rig_state(service: Service) -> JsonObject:
 
 
 def plates_shown(versions: list[PlatesVersion]) -> JsonObject | None:
-    """Returns when the clean plates in use were taken, the previous version, and a newer refused one, given all
-    versions, newest first. Returns None if no version is in use, as in the simulated studio."""
+    """Returns when the clean plates in use were taken, the previous version, and a newer refused version, given all
+    versions, newest first. Returns None if no clean plates are in use, as in the simulated studio."""
     in_use = next((version for version in versions if version.in_use), None)
     if in_use is None:
         return None
@@ -103,7 +103,7 @@ def _plates_line(version: PlatesVersion | None) -> JsonObject | None:
 
 def calibration_in_use(service: Service) -> JsonObject | None:
     """Returns label, time and RMS reprojection error (px) of the calibration in use; None if this service did not make
-    it."""
+    that calibration."""
     if service.calibrations.in_use() is None:
         return None
     used = next((one for one in known_calibrations(service, 2.0) if one.in_use), None)
@@ -123,7 +123,7 @@ def moved_cameras(service: Service) -> set[str]:
 
 
 def read_report(service: Service, job_id: str) -> Report | None:
-    """Reads report.json of a finished job; None if there is none. It is cached, since results do not change."""
+    """Reads report.json of a finished job; None if it is missing. Reports are cached, since results never change."""
     path = service.store.folder("jobs", job_id) / "result" / "report.json"
 
     def read() -> Report | None:
@@ -133,7 +133,7 @@ def read_report(service: Service, job_id: str) -> Report | None:
 
 
 def capture(page: Page, event: Mapping[str, str | None]) -> Message:
-    """Takes a shot and shows it for a decision."""
+    """Takes a shot and shows it, so that the operator can decide whether to keep it."""
     record = page.service.captures.take(CaptureMetadata.of(event))
     page.choice["shot"] = record.id
     shared.forget("rig")
@@ -164,8 +164,8 @@ def reconstruct_shot(page: Page, event: JsonObject) -> Message:
 
 
 def plates(page: Page, event: object) -> Message | None:
-    """Takes clean plates of the empty studio. Returns None if they show a person; the page then asks whether to use
-    them. Raises DiskFull and Unavailable."""
+    """Takes clean plates of the empty studio. Returns None if the clean plates show a person; the page then asks
+    whether to use them. Raises DiskFull and Unavailable."""
     page.service.store.reserve(0, page.service.settings.free_bytes)
     try:
         taken = page.service.rig.take_background()
@@ -179,7 +179,7 @@ def plates(page: Page, event: object) -> Message | None:
 
 
 def use_plates(page: Page, event: JsonObject) -> Message:
-    """Puts a version of the clean plates to use. Raises NotFound and Unavailable."""
+    """Starts to use a stored version of the clean plates. Raises NotFound and Unavailable."""
     page.service.rig.use_plates(event["id"])
     shared.forget("rig")
     return compose("plates-taken-into-use")

@@ -37,8 +37,8 @@ class ServicePage(Page, component="service.js"):
     secret: str | None = None  # of a key that was made a moment ago, until the page has it
 
     def look(self) -> JsonObject:
-        """Returns the state of the page. Only callers with the scope admin see the keys. ``open``: there are no API
-        keys, so everybody at this machine may do everything."""
+        """Returns the state of the page. Only callers with the scope admin see the keys. ``open``: whether there are no
+        API keys, so that everybody at this machine may do everything."""
         admin, service, data = self.caller.may("admin"), self.service, str(self.service.store.data.resolve())
         return {
             "keys": [*key_lines(service, self.caller)] if admin else None,
@@ -58,7 +58,7 @@ class ServicePage(Page, component="service.js"):
 
 
 def key_lines(service: Service, caller: Caller) -> list[JsonObject]:
-    """Converts all API keys to entries of the list, oldest first. ``caller``: to mark the caller's key."""
+    """Converts all API keys to entries of the list, oldest first. The API key of ``caller`` is marked."""
     return [
         {
             "id": key.id,
@@ -93,7 +93,7 @@ def _days(days: float | None) -> Message:
 
 
 def add_key(page: ServicePage, event: JsonObject) -> Message:
-    """Makes an API key. Raises InputError naming every fault of the form, and Forbidden where no key exists."""
+    """Makes an API key. Raises InputError naming every fault of the form, and Forbidden if there is no API key yet."""
     name, scopes = event["label"].strip(), [scope for scope in SCOPES if scope in event["scopes"]]
     faults = []
     if not name or len(name) > NAME_MOST:
@@ -109,7 +109,7 @@ def add_key(page: ServicePage, event: JsonObject) -> Message:
 
 
 def revoke(page: ServicePage, event: JsonObject) -> Message:
-    """Removes an API key. Raises NotFound, and Conflict for the key that the caller uses."""
+    """Removes an API key. Raises NotFound for an unknown key, and Conflict for the key that the caller uses."""
     if event["id"] == page.caller.key:
         raise Conflict("own-key", compose("own-key"))
     page.service.keys.remove(event["id"])
@@ -125,7 +125,7 @@ def clear(page: ServicePage, event: object) -> Message:
 
 def remove_failed(page: ServicePage, event: object) -> Message:
     """Removes the failed and cancelled jobs, at most ``REMOVED_AT_ONCE``, after the time to undo has passed. Raises
-    Conflict if there are none."""
+    Conflict if there are no failed or cancelled jobs."""
     jobs = page.service.jobs
     ids = [job.id for job in jobs.page(JobQuery("", FAILED), REMOVED_AT_ONCE).items]
     if not ids:
@@ -136,7 +136,7 @@ def remove_failed(page: ServicePage, event: object) -> Message:
 
 
 def sweep_now(page: ServicePage, event: object) -> Message:
-    """Removes now what retention would remove at its next turn. The message states how much was removed."""
+    """Removes now what retention would remove next. The returned message states how much was removed."""
     gone = {kind: count for kind, count in sweep(page.service).items() if count}
     forget_storage(page.service)
     removed = [compose("gone-of-kind", count=count, kind=kind) for kind, count in gone.items()]
@@ -144,7 +144,7 @@ def sweep_now(page: ServicePage, event: object) -> Message:
 
 
 def forget_storage(service: Service) -> None:
-    """Drops the cached figures of the disk and of what retention removes next, so that they are computed anew."""
+    """Drops the cached figures of the disk and of what retention removes next, which are then computed anew."""
     service.storage.forget()
     shared.forget("storage", "upcoming")
 

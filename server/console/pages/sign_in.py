@@ -1,4 +1,4 @@
-"""Implements the page that asks for an API key. The key is sent over the page's socket, never in an address."""
+"""Implements the page that asks for an API key. The API key is sent over the page's socket, never in an address."""
 
 import asyncio
 
@@ -16,8 +16,8 @@ WRONG_PAUSE_S = 1.0  # after a key that is nobody's
 
 
 class SignIn(Element, component="sign_in.js"):
-    """Shows the form for an API key. A valid key's id is stored in the browser's session, and the page of the rig
-    opens. After a wrong key the form waits a second, which slows guessing."""
+    """Shows the form for an API key. The id of a valid API key is stored in the browser's session, and the page of the
+    rig opens. After a wrong key the form waits a second, which slows guessing."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -35,7 +35,7 @@ class SignIn(Element, component="sign_in.js"):
 
 @ui.page("/sign-in")
 async def sign_in_page() -> None:
-    """Serves the page that asks for an API key. If no key is needed, it redirects to the page of the rig."""
+    """Serves the page that asks for an API key, or redirects to the page Rig if no API key is needed."""
     ui.page_title("Sign in - eigenhead")
     caller = await signed_in()
     if caller is not None and caller.key == "local":

@@ -1,5 +1,5 @@
-"""Declares the routes of batches: begin, watch, pause and retry them, and fetch the table and the sheet of their
-heads."""
+"""Declares the routes of batches: begin, watch, pause and retry batches, and fetch the table and contact sheet of a
+batch's heads."""
 
 from typing import Annotated
 
@@ -37,7 +37,7 @@ SHEET: Responses = {200: {"content": {"text/html": TEXT, PDF_TYPE: {}}}, **docum
 
 
 class NewBatch(Received):
-    """Requests a batch. Its captures are named in one of three ways: ``captures``, ``session`` or ``prefix``."""
+    """Requests a batch of captures, which are named in one of three ways: ``captures``, ``session`` or ``prefix``."""
 
     model_config = example(
         {"label": "Study 4", "prefix": "S4-", "settings": {"detail": "fine"}}, {"captures": [EXAMPLE_ID]}
@@ -66,8 +66,8 @@ class BatchList(Listed):
 def submit_batch(
     service: ServiceOf, caller: Submitter, wanted: NewBatch, response: Response, idempotency_key: Idempotency = None
 ) -> BatchOut:
-    """Queues a job for each of many captures, behind the jobs of others. The same Idempotency-Key with the same request
-    returns the first batch."""
+    """Queues a job for each of many captures, behind the jobs of other users. Repeating the request with the same
+    Idempotency-Key returns the first batch."""
     request = BatchRequest(
         ReconstructionRequest(wanted.model, wanted.settings, deliver_to=wanted.deliver_to),
         wanted.captures,
@@ -100,13 +100,13 @@ def list_batches(
 @router.get("/batches/{batch_id}", responses=documented(404))
 def get_batch(service: ServiceOf, caller: Reader, batch_id: str) -> BatchOut:
     """Returns a batch: its state, its captures by state, and the estimated remaining seconds. ``GET /v1/jobs?batch=``
-    lists its jobs."""
+    lists a batch's jobs."""
     return service.batches.get(batch_id)
 
 
 @router.post("/batches/{batch_id}/pause", responses=documented(404, 409))
 def pause_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
-    """Pauses a batch: no further job begins, running jobs continue. Queued jobs are withdrawn within a second."""
+    """Pauses a batch: running jobs continue, no further job begins, queued jobs are withdrawn within a second."""
     return service.batches.pause(batch_id)
 
 
@@ -118,8 +118,8 @@ def resume_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchO
 
 @router.post("/batches/{batch_id}/cancel", responses=documented(404))
 def cancel_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
-    """Cancels the jobs that have not ended; they cannot be resumed. Results stay. A batch that has ended does not
-    change."""
+    """Cancels a batch's jobs that have not ended; cancelled jobs cannot be resumed. Results stay. Cancelling has no
+    effect on a batch that has ended."""
     return service.batches.cancel(batch_id)
 
 
@@ -131,7 +131,7 @@ def retry_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOu
 
 @router.delete("/batches/{batch_id}", status_code=204, responses=documented(404, 409))
 def delete_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> None:
-    """Removes the record of a batch that has ended. Its jobs and heads stay."""
+    """Removes the record of a batch that has ended. The batch's jobs and heads stay."""
     service.batches.remove(batch_id)
 
 
@@ -148,6 +148,6 @@ def get_batch_table(
 def get_batch_sheet(
     service: ServiceOf, caller: Reader, batch_id: str, form: Annotated[SheetFormat, Query(alias="format")] = "html"
 ) -> Response:
-    """Returns the contact sheet: three views of each head, and its warnings in colour. ``html`` is one self-contained
-    file, ``pdf`` has A4 pages."""
+    """Returns a batch's contact sheet: three views of each head, and the head's warnings in colour. With ``html`` the
+    sheet is one self-contained file, with ``pdf`` it has A4 pages."""
     return send_sheet(service, batch_id, form)

@@ -29,8 +29,8 @@ BODY["requestBody"]["content"]["application/json"] = {"schema": NewCalibration.m
 
 @router.post("", status_code=202, responses=documented(400, 404, 408, 413, 415, 507), openapi_extra=BODY)
 async def make_calibration(service: ServiceOf, caller: Taker, request: Request, response: Response) -> CalibrationOut:
-    """Queues a calibration of an uploaded archive (multipart), or of captures that the rig took (JSON). They show the
-    board or, with ``"from": "scene"``, any scene."""
+    """Queues a calibration of an uploaded archive (multipart), or of captures that the rig took (JSON). The pictures
+    show the calibration board or, with ``"from": "scene"``, any scene."""
     if request.headers.get("content-type", "").partition(";")[0].strip() == "application/json":
         await service.threads.disk(check_length, request, service.store, service.settings)
         wanted = _parsed(await _small_body(request))
@@ -50,7 +50,7 @@ def list_calibrations(service: ServiceOf, caller: Reader) -> CalibrationList:
 
 @router.get("/{calibration_id}", responses=documented(404))
 def get_calibration(service: ServiceOf, caller: Reader, calibration_id: str) -> CalibrationOut:
-    """Returns a calibration: its state and, once it has succeeded, figures and checks."""
+    """Returns a calibration: its state and, once it has succeeded, its figures and checks."""
     return service.calibrations.get(calibration_id)
 
 
@@ -70,13 +70,13 @@ def get_cameras(service: ServiceOf, caller: Reader, request: Request, calibratio
     response_class=FileResponse,
 )
 def get_report(service: ServiceOf, caller: Reader, request: Request, calibration_id: str) -> Response:
-    """Returns the report as a self-contained HTML page: residuals, coverage, uncertainty."""
+    """Returns a calibration's report as a self-contained HTML page: residuals, coverage, uncertainty."""
     return send_file(request, service.calibrations.file(calibration_id, "report.html"))
 
 
 @router.delete("/{calibration_id}", status_code=204, responses=documented(404, 409))
 def remove_calibration(service: ServiceOf, caller: Taker, calibration_id: str) -> None:
-    """Removes a calibration's pictures and report. If it is in use, its cameras stay in use."""
+    """Removes a calibration's pictures and report. If the calibration is in use, its cameras stay in use."""
     service.calibrations.remove(calibration_id)
 
 

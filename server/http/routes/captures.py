@@ -1,4 +1,4 @@
-"""Declares the routes of captures: taking or uploading them, viewing them, setting feature points, removing them."""
+"""Declares the routes of captures: taking, uploading, viewing and removing captures, and setting feature points."""
 
 import json
 from collections.abc import Callable
@@ -50,8 +50,8 @@ TAGS = "with commas between"
 
 @router.post("/captures", status_code=201, responses=documented(400, 404, 413, 415, 507))
 def take_capture(service: ServiceOf, caller: Taker, wanted: NewCapture, response: Response) -> CaptureOut:
-    """Takes a shot with the rig at once. Answers 201 when every camera has delivered, and 503 naming what is missing if
-    one has not.
+    """Takes a shot with the rig at once. Answers 201 if every camera has delivered a picture, and otherwise 503 with
+    the missing cameras.
 
     ``board``: takes pictures of the calibration board for ``POST /v1/calibrations``, from those cameras that deliver.
     """
@@ -66,7 +66,7 @@ def take_capture(service: ServiceOf, caller: Taker, wanted: NewCapture, response
     openapi_extra=described_form(ARCHIVE, FIELDS, tags=TAGS),
 )
 async def upload_capture(service: ServiceOf, caller: Taker, request: Request, response: Response) -> CaptureOut:
-    """Receives a capture folder as an archive. If it has faults, 422 names all of them and nothing is stored."""
+    """Receives a capture folder as an archive. A capture with faults is not stored, and the answer 422 names them."""
     record, _ = await receive_capture(service, request, caller.key)
     return _created(record, response)
 
@@ -74,8 +74,8 @@ async def upload_capture(service: ServiceOf, caller: Taker, request: Request, re
 @router.post("/captures/imports", status_code=201, responses=documented(400, 404, 413, 415, 507))
 async def import_capture(service: ServiceOf, caller: Taker, wanted: NewImport, response: Response) -> CaptureOut:
     """Downloads a capture folder as an archive from a server that the operator allowed (``EIGENHEAD_IMPORT_ORIGINS``;
-    403 if none is), or takes it from an object store (``EIGENHEAD_IMPORT_PREFIXES``): an archive, or with a slash
-    at the end of ``url`` all files below it. 422 names every fault in it."""
+    403 if none is), or takes it from an object store (``EIGENHEAD_IMPORT_PREFIXES``): an archive, or all files below a
+    ``url`` that ends in a slash. Answers 422 naming every fault of the capture."""
     stored = wanted.url.startswith(("s3://", "file://"))
     if not (service.settings.import_prefixes if stored else service.settings.import_origins):
         raise Forbidden("imports-off", compose("stored-imports-not-allowed" if stored else "imports-not-allowed"))
@@ -116,8 +116,8 @@ def list_captures(
 
 @router.post("/captures/bulk", responses=documented(400, 413, 415, 507))
 def change_captures(service: ServiceOf, caller: Taker, wanted: CaptureBulk) -> BulkOut:
-    """Applies one action to many captures. Captures to which it cannot be applied are reported and do not stop the
-    others. ``reconstruct`` also needs the scope ``submit``, and ``erase`` the scope ``erase``."""
+    """Applies one action to many captures. Captures to which the action cannot be applied are reported and do not stop
+    the others. The action ``reconstruct`` also needs the scope ``submit``, and ``erase`` the scope ``erase``."""
     caller.check_may({"reconstruct": "submit", "erase": "erase"}.get(wanted.action, "capture"))
     work = ReconstructionRequest(wanted.model, wanted.settings)
     work.check()
@@ -140,7 +140,7 @@ def get_capture(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureO
 
 @router.get("/captures/{capture_id}/checks", responses=documented(404))
 def get_checks(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureChecks:
-    """Returns the reasons for the verdict: exposure, sharpness and position by camera, and the subject's outline."""
+    """Returns the reasons for a capture's verdict: by camera, exposure, sharpness, and the subject's outline."""
     return CaptureChecks.model_validate({"cameras": service.store.checks(capture_id)})
 
 
@@ -172,8 +172,8 @@ def get_background(service: ServiceOf, caller: Reader, request: Request, capture
 
 @router.put("/captures/{capture_id}/features", responses=documented(400, 404, 409, 413, 415, 507))
 def put_features(service: ServiceOf, caller: Taker, capture_id: str, features: NewFeatures) -> CaptureOut:
-    """Stores feature points (pixels) in place of earlier ones; later jobs use them. 422 names every point that does not
-    fit the capture; 409 is for a capture of the calibration board."""
+    """Stores feature points (pixels) for later jobs, in place of earlier points. Answers 422 naming every point that
+    does not fit the capture, and 409 for a capture of the calibration board."""
     return CaptureOut.model_validate(service.captures.put_features(capture_id, features.points))
 
 
@@ -196,10 +196,10 @@ def delete_capture(
     capture_id: str,
     erase: Annotated[bool, Query(description="its jobs and heads, too, for good")] = False,
 ) -> None:
-    """Removes a capture with its images. Its jobs and their results, which show the face, stay. 409 while a queued or
-    running job needs it.
+    """Removes a capture with its images. The capture's jobs and their results, which show the face, stay. Answers 409
+    while a queued or running job needs the capture.
 
-    With ``erase`` its jobs are cancelled and removed with their results; that also needs the scope ``erase``.
+    With ``erase``, which needs the scope ``erase``, the capture's jobs are cancelled and removed with their results.
     """
     if erase:
         caller.check_may("erase")
@@ -218,8 +218,8 @@ def delete_capture(
 async def reconstruct_upload(
     service: ServiceOf, caller: Submitter, request: Request, response: Response, idempotency_key: Idempotency = None
 ) -> JobOut:
-    """Receives a capture and queues its job in one call. The same Idempotency-Key with the same files and settings
-    returns the first job."""
+    """Receives a capture and queues a job for it in one call. Repeating the request with the same Idempotency-Key,
+    files and settings returns the first job."""
     record, fields = await receive_capture(service, request, caller.key, (*ABOUT, *OF_JOB))
     try:
         name = (fields.get("name") or "")[:TEXT_MOST]

@@ -1,5 +1,4 @@
-"""Declares the routes of jobs: submitting, watching, cancelling and restarting them, and fetching the files they
-made."""
+"""Declares the routes of jobs: submitting, watching, cancelling and restarting jobs, and fetching result files."""
 
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
@@ -53,7 +52,7 @@ EXPORT: Responses = {200: {"content": {"application/zip": {}}}, **documented(400
 def submit_job(
     service: ServiceOf, caller: Submitter, wanted: NewJob, response: Response, idempotency_key: Idempotency = None
 ) -> JobOut:
-    """Queues a reconstruction. The same Idempotency-Key with the same request returns the first job."""
+    """Queues a reconstruction. Repeating the request with the same Idempotency-Key returns the first job."""
     hook: JobWebhook | None = wanted.webhook and {"url": wanted.webhook.url, "secret": wanted.webhook.secret}
     job = service.jobs.submit(
         wanted.capture_id,
@@ -100,7 +99,7 @@ def list_jobs(
 
 @router.post("/jobs/bulk", responses=documented(400, 413, 415, 507))
 def change_jobs(service: ServiceOf, caller: Submitter, wanted: JobBulk) -> BulkOut:
-    """Applies one action to many jobs. Jobs to which it cannot be applied are reported and do not stop the others."""
+    """Applies one action to many jobs. Jobs that cannot take the action are reported and do not stop the others."""
     actions: dict[str, Callable[[str], object]] = {
         "cancel": service.cancel,
         "restart": lambda job: service.jobs.restart(job, ReconstructionRequest(), key=caller.key),
@@ -111,7 +110,7 @@ def change_jobs(service: ServiceOf, caller: Submitter, wanted: JobBulk) -> BulkO
 
 @router.get("/jobs/{job_id}", responses=documented(404))
 def get_job(service: ServiceOf, caller: Reader, job_id: str) -> JobOut:
-    """Returns a job: its state, stage, progress, remaining seconds, and once it has succeeded its files."""
+    """Returns a job: its state, stage, progress, remaining seconds and, once the job has succeeded, its files."""
     return service.jobs.get(job_id)
 
 
@@ -152,7 +151,7 @@ async def job_events(
 
 @router.post("/jobs/{job_id}/cancel", responses=documented(404))
 def cancel_job(service: ServiceOf, caller: Submitter, job_id: str) -> JobOut:
-    """Cancels a job, in any stage; its worker stops within a second. A finished job does not change."""
+    """Cancels a job, in any stage; its worker stops within a second. Cancelling has no effect on a finished job."""
     return service.cancel(job_id)
 
 
@@ -160,23 +159,23 @@ def cancel_job(service: ServiceOf, caller: Submitter, job_id: str) -> JobOut:
 def restart_job(
     service: ServiceOf, caller: Submitter, job_id: str, response: Response, wanted: Restart | None = None
 ) -> JobOut:
-    """Queues a new job for the same capture, with another model or settings if given; ``restart_of`` names the old
-    job."""
+    """Queues a new job for the same capture, with another model or other settings if the request names them;
+    ``restart_of`` names the old job."""
     work = ReconstructionRequest(wanted.model, wanted.settings) if wanted else ReconstructionRequest()
     return _accepted(service.jobs.restart(job_id, work, key=caller.key), response)
 
 
 @router.post("/jobs/{job_id}/delivery", status_code=202, responses=documented(400, 403, 404, 409, 413, 415))
 def deliver_job(service: ServiceOf, caller: Submitter, job_id: str, wanted: NewDelivery | None = None) -> JobOut:
-    """Delivers the result of a job to an object store: for the first time, again after a failure, or elsewhere. 409
-    while it is being delivered."""
+    """Delivers the result of a job to an object store: for the first time, again after a failure, or to another store.
+    Answers 409 while the result is being delivered."""
     return service.deliver(job_id, None if wanted is None else wanted.to)
 
 
 @router.post("/jobs/{job_id}/exports", responses=EXPORT, response_class=Response)
 async def export_job(service: ServiceOf, caller: Reader, request: Request, job_id: str, wanted: NewExport) -> Response:
-    """Returns the head of a finished job in another format, with its materials and textures, as one .zip. No new job is
-    made."""
+    """Returns the head of a finished job in another format, with its materials and textures, as one .zip. The export
+    makes no new job."""
     gone = partial(await_hang_up, request.receive)
     return send_zip(await service.threads.check(service.export, job_id, wanted.outputs(), key=caller.key, hung_up=gone))
 
@@ -193,7 +192,7 @@ def delete_job(service: ServiceOf, caller: Submitter, job_id: str) -> None:
     response_class=PlainTextResponse,
 )
 def get_job_log(service: ServiceOf, caller: Reader, job_id: str) -> str:
-    """Returns the workers' log of this job: stages, warnings, outcome. 404 before it begins."""
+    """Returns the workers' log of a job: stages, warnings, outcome. Answers 404 before the job begins."""
     return service.jobs.log(job_id)
 
 
@@ -211,7 +210,7 @@ RESULT: Responses = {
 
 @router.get("/jobs/{job_id}/result", responses=documented(404, 409))
 def list_result(service: ServiceOf, caller: Reader, job_id: str) -> ResultList:
-    """Lists the files of a job's result. Each is fetched at its ``url``, all of them as ``all.zip``."""
+    """Lists the files of a job's result. Each file is fetched at its ``url``, all files together as ``all.zip``."""
     files = [
         {"name": name, "url": f"/v1/jobs/{job_id}/result/{quote(name)}", "media_type": media_type(name), **file}
         for name, file in service.jobs.files(job_id).items()
@@ -222,7 +221,7 @@ def list_result(service: ServiceOf, caller: Reader, job_id: str) -> ResultList:
 @router.head("/jobs/{job_id}/result/all.zip", include_in_schema=False)
 @router.get("/jobs/{job_id}/result/all.zip", responses=ARCHIVE, response_class=StreamingResponse)
 def get_archive(service: ServiceOf, caller: Reader, request: Request, job_id: str) -> Response:
-    """Returns all files of the result as one archive, which is packed while it is sent."""
+    """Returns all files of a job's result as one archive, which is packed while it is sent."""
     files = service.jobs.files(job_id)
     return send_archive(request, service.jobs.result_folder(job_id), files)
 
@@ -232,8 +231,8 @@ def get_archive(service: ServiceOf, caller: Reader, request: Request, job_id: st
 def get_result(
     service: ServiceOf, caller: Reader, request: Request, job_id: str, name: str, redirect: bool = False
 ) -> Response:
-    """Returns a file of the result: head.ply, head.glb, report.json, contact_sheet.png, overlays/<camera>.png and so
-    on. ``GET .../result`` lists them. With ``redirect`` a result that an S3 store keeps is answered with 307 and a
+    """Returns a file of a job's result: head.ply, head.glb, report.json, contact_sheet.png, overlays/<camera>.png and
+    so on. ``GET .../result`` lists them. With ``redirect`` a result that an S3 store keeps is answered with 307 and a
     signed address of the store, which holds for five minutes and takes no API key."""
     address = service.jobs.results.link(job_id, name) if redirect and name in service.jobs.files(job_id) else None
     if address is not None:

@@ -1,4 +1,4 @@
-"""Declares the route of the live head: lamps of the cameras, the head of the subject, and instructions."""
+"""Declares the route of the live view of a subject's head, with indicator lamps for each camera, and instructions."""
 
 from collections.abc import AsyncIterator
 from typing import Annotated
@@ -30,7 +30,7 @@ def rig_live(
     accept: Annotated[str, Header(max_length=1000)] = "",
     seconds: Annotated[float, Query(gt=0, le=3600, description="after which a stream ends")] = 600.0,
 ) -> Response | LiveOut:
-    """Returns the subject's head, lamps of each camera, and instructions before a shot.
+    """Returns, before a shot, the subject's head, indicator lamps for each camera, and instructions.
 
     The cameras take pictures only while clients send requests, so the first answers have no head. With ``Accept:
     text/event-stream`` each new state is sent as an event ``look``."""

@@ -1,5 +1,5 @@
-"""Declares the routes of storage, retention, health, readiness, metrics, models, templates, keys and webhooks, with
-their documents, and the page that shows the API."""
+"""Declares the routes of storage, retention, health, readiness, metrics, models, templates, keys and webhooks, with the
+routes' JSON documents, and the page that shows the API."""
 
 from importlib.metadata import version
 from pathlib import Path
@@ -58,7 +58,7 @@ class NewKey(Received):
 
 
 class ModelOut(Answer):
-    """Describes a head model that a job may name; ``bytes`` is the size of its file."""
+    """Describes a head model that a job may name; ``bytes`` is the size of the model's file."""
 
     id: str
     name: str
@@ -107,7 +107,7 @@ class Health(Answer):
 
 
 class Ready(Answer):
-    """States whether the service can take work: every check, and whether all passed."""
+    """States whether the service can take work: the result of every check, and whether all checks passed."""
 
     ready: bool
     checks: dict[str, CheckOut]
@@ -121,7 +121,7 @@ class TemplateList(Answer):
 
 @router.get("/v1/storage", tags=["operations"], responses=documented())
 def get_storage(service: ServiceOf, caller: Reader) -> StorageOut:
-    """Returns the bytes of each kind of data, as they were last measured. If that is older than five minutes, a new
+    """Returns the bytes of each kind of data, as last measured. If the measurement is older than five minutes, a new
     measurement starts, but the answer does not wait for it."""
     return service.storage.use()
 
@@ -136,21 +136,21 @@ def get_retention(service: ServiceOf, caller: Reader) -> RetentionOut:
 
 @router.get("/docs", include_in_schema=False)
 def docs() -> FileResponse:
-    """Returns a page that shows the API. The browser builds it from openapi.json and loads nothing from other
+    """Returns a page that shows the API. The browser builds the page from openapi.json and loads nothing from other
     servers."""
     return FileResponse(DOCS, media_type="text/html")
 
 
 @router.get("/healthz", tags=["operations"])
 async def healthz() -> Health:
-    """Answers as long as the process runs. It checks nothing else; ``/readyz`` does."""
+    """Answers as long as the service's process runs, without the checks of ``/readyz``."""
     return Health(status="ok", version=version("eigenhead"))
 
 
 @router.get("/readyz", tags=["operations"], responses={503: {"model": Ready, "description": "Not ready"}})
 def readyz(service: ServiceOf, response: Response) -> Ready:
-    """Returns whether the service can take work: OpenGL, disk, database, a worker, the rig. If not, the status is 503,
-    with the same document."""
+    """Returns whether the service can take work: OpenGL, disk, database, a worker, the rig. If the service cannot take
+    work, the answer has the status 503 and the same document."""
     checks = readiness(service)
     ready = all(check.ok for check in checks.values())
     response.status_code = 200 if ready else 503
@@ -195,8 +195,8 @@ def list_templates(service: ServiceOf, caller: Reader) -> TemplateList:
 
 @router.post("/v1/keys", status_code=201, tags=["access"], responses=documented(400, 413, 415, 507))
 def add_key(service: ServiceOf, caller: Admin, wanted: NewKey) -> NewKeyOut:
-    """Makes an API key. The answer is the only time that it is shown. The first key is made by ``eigenhead keys add``;
-    without any, this is 403."""
+    """Makes an API key. The key's secret is shown only in this answer. If there is no key yet, the answer is 403;
+    ``eigenhead keys add`` makes the first key."""
     key = service.keys.add_for(caller, wanted.name, tuple(wanted.scopes))
     return NewKeyOut(id=key.split("_")[1], key=key)
 
@@ -209,8 +209,7 @@ def list_keys(service: ServiceOf, caller: Admin) -> KeyList:
 
 @router.delete("/v1/keys/{key_id}", status_code=204, tags=["access"], responses=documented(404, 409))
 def remove_key(service: ServiceOf, caller: Admin, key_id: str) -> None:
-    """Removes an API key. A key cannot remove itself, so that removing the last one by accident does not leave the
-    service without keys."""
+    """Removes an API key. A key cannot remove itself, so that nobody removes the last key by accident."""
     if key_id == caller.key:
         raise Problem(409, "own-key", compose("own-key"))
     service.keys.remove(key_id)
@@ -230,5 +229,5 @@ def list_webhooks(service: ServiceOf, caller: Admin) -> WebhookList:
 
 @router.delete("/v1/webhooks/{webhook_id}", status_code=204, tags=["webhooks"], responses=documented(404))
 def remove_webhook(service: ServiceOf, caller: Admin, webhook_id: str) -> None:
-    """Removes an address, which gets no further messages."""
+    """Removes an address, which then gets no further messages about jobs and batches."""
     service.webhooks.remove(webhook_id)

@@ -76,14 +76,14 @@ async def _pictures(service: Service, name: str, picture: bytes, seconds: float)
 
 @router.get("/cameras/{name}/settings", responses=documented(404))
 def camera_settings(service: ServiceOf, caller: Reader, name: str) -> CameraSettingsOut:
-    """Returns exposure, gain and white balance as requested of a camera, and which of them it did not accept."""
+    """Returns the exposure, gain and white balance requested of a camera, and which of these it did not accept."""
     return service.rig.camera_settings(name)
 
 
 @router.patch("/cameras/{name}/settings", responses=documented(400, 404, 409, 413, 415, 507))
 def set_camera(service: ServiceOf, caller: Taker, name: str, wanted: CameraSettingsEdit) -> CameraSettingsOut:
-    """Changes settings of a camera, also for later starts. New clean plates are needed afterwards. 409 in the simulated
-    studio."""
+    """Changes settings of a camera, also for later starts of the service; afterwards the rig needs new clean plates.
+    Answers 409 in the simulated studio."""
     return service.rig.set_camera(name, wanted.model_dump(exclude_unset=True))
 
 
@@ -95,8 +95,8 @@ def rig_lights(service: ServiceOf, caller: Reader) -> Lights:
 
 @router.put("/lights", responses=documented(400, 409, 413, 415, 507))
 def set_lights(service: ServiceOf, caller: Taker, wanted: Lights) -> Lights:
-    """Selects the lamps that are on during a shot, also for later starts. New clean plates are needed afterwards. 409
-    in the simulated studio."""
+    """Selects the lamps that are on during a shot, also for later starts of the service; afterwards the rig needs new
+    clean plates. Answers 409 in the simulated studio."""
     return Lights(outputs=list(service.rig.set_lights(tuple(sorted(set(wanted.outputs))))))
 
 
@@ -104,8 +104,8 @@ def set_lights(service: ServiceOf, caller: Taker, wanted: Lights) -> Lights:
 def take_background(service: ServiceOf, caller: Taker) -> BackgroundOut:
     """Takes new clean plates of the empty studio and uses them for later captures.
 
-    If this fails (503), or if the new plates show a person whom the old ones do not (409), the old plates stay in use.
-    After a 409 the new plates are stored, and ``PUT`` can select them nevertheless.
+    If taking the plates fails (503), or if the new plates show a person whom the old plates do not show (409), the old
+    plates stay in use. After a 409 the new plates are stored, and ``PUT`` can still select them.
     """
     service.store.reserve(0, service.settings.free_bytes)
     return BackgroundOut.model_validate(service.rig.take_background())
@@ -113,13 +113,13 @@ def take_background(service: ServiceOf, caller: Taker) -> BackgroundOut:
 
 @router.get("/background", responses=documented())
 def list_plates(service: ServiceOf, caller: Reader) -> PlatesList:
-    """Lists the stored clean plates, newest first: those in use, earlier ones, and those that were refused."""
+    """Lists the stored clean plates, newest first: the plates in use, earlier plates, and refused plates."""
     return PlatesList(versions=[PlatesOut.model_validate(kept) for kept in service.rig.plates()])
 
 
 @router.put("/background", responses=documented(400, 404, 413, 415, 507))
 def use_plates(service: ServiceOf, caller: Taker, wanted: UsePlates) -> PlatesList:
-    """Selects stored clean plates for later captures: earlier ones, or refused ones nevertheless."""
+    """Selects stored clean plates for later captures, which may be earlier plates or refused plates."""
     service.rig.use_plates(wanted.version)
     return list_plates(service, caller)
 

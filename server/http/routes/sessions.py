@@ -39,8 +39,8 @@ def list_subjects(
     limit: Limit = 100,
     cursor: Cursor = None,
 ) -> SubjectList:
-    """Lists people in pages, each with the newest head. Sessions with the same name are one person's. ``q`` searches
-    label and consent."""
+    """Lists people in pages, each with the newest head. Sessions with the same name belong to one person. ``q``
+    searches label and consent."""
     found = service.sessions.subjects(q, sort, limit, cursor, tag=tag)
     return SubjectList(subjects=list(found.items), next=found.next, total=found.total)
 
@@ -53,7 +53,7 @@ def get_session(service: ServiceOf, caller: Reader, session_id: str) -> SessionO
 
 @router.patch("/sessions/{session_id}", responses=documented(400, 404, 413, 415, 507))
 def edit_session(service: ServiceOf, caller: Taker, session_id: str, wanted: SessionEdit) -> SessionOut:
-    """Changes the label or the consent note of a session. Keys that are left out keep their values."""
+    """Changes the label or the consent note of a session. Keys that the request leaves out keep their values."""
     return service.sessions.edit(session_id, label=wanted.label, consent=wanted.consent)
 
 

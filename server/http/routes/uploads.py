@@ -1,7 +1,7 @@
 """Declares the routes of resumable uploads, tus 1.0 (https://tus.io/protocols/resumable-upload), with its extensions
 creation, termination, checksum and expiration.
 
-The PATCH that brings the last byte answers with the capture's ``Location``, or with a 422 that names every fault.
+The PATCH with the last byte is answered with the capture's ``Location``, or with a 422 that names every fault.
 """
 
 import base64
@@ -71,7 +71,7 @@ def tus_create(
 
 @router.head("/{upload_id}", responses=documented(404, 412))
 def tus_head(service: ServiceOf, caller: Taker, upload_id: str, tus_resumable: Resumable = None) -> Response:
-    """Returns how many bytes have arrived, and the capture's ``Location`` once it has been made."""
+    """Returns how many bytes of an upload have arrived and, once the capture has been made, its ``Location``."""
     _check_version(tus_resumable)
     record = _owned_upload(service, caller, upload_id)
     headers = {"Upload-Offset": str(service.uploads.offset(record)), "Upload-Length": str(record.length)}
@@ -98,8 +98,8 @@ async def tus_patch(
     upload_offset: Annotated[str | None, Header(alias="Upload-Offset")] = None,
     upload_checksum: Annotated[str | None, Header(alias="Upload-Checksum", max_length=200)] = None,
 ) -> Response:
-    """Appends bytes at ``Upload-Offset``. The last byte makes the capture: the answer has its ``Location``, or 422
-    names every fault."""
+    """Appends bytes at ``Upload-Offset``. After the last byte the service makes the capture: the answer has the
+    capture's ``Location``, or 422 names every fault."""
     _check_version(tus_resumable)
     if request.headers.get("content-type") != "application/offset+octet-stream":
         raise Problem(415, "unsupported-media-type", compose("offset-stream-wanted"))
@@ -120,7 +120,7 @@ async def tus_patch(
 
 @router.delete("/{upload_id}", status_code=204, responses=documented(404, 409, 412))
 def tus_delete(service: ServiceOf, caller: Taker, upload_id: str, tus_resumable: Resumable = None) -> Response:
-    """Discards an upload; a capture that was made from it stays. 409 while bytes of it are arriving."""
+    """Discards an upload; a capture that was made from it stays. Answers 409 while bytes of the upload are arriving."""
     _check_version(tus_resumable)
     record = _owned_upload(service, caller, upload_id)
     with service.uploads.lock(record.id):
@@ -129,7 +129,7 @@ def tus_delete(service: ServiceOf, caller: Taker, upload_id: str, tus_resumable:
 
 
 def _finish(service: Service, record: UploadRecord) -> UploadRecord:
-    """Makes the capture. An archive that cannot be used is removed with its upload."""
+    """Makes the capture. If the archive cannot be used, it is removed with its upload."""
     try:
         with service.store.incoming() as folder:
             data = service.uploads.data(record)
@@ -160,7 +160,7 @@ def _check_version(version: str | None) -> None:
 
 
 def _metadata(text: str | None) -> dict[str, str]:
-    """Decodes tus metadata, ``key base64, key base64``. Raises a 400 problem for anything else."""
+    """Decodes tus metadata, ``key base64, key base64``. Raises a 400 problem for a text of another form."""
     fields: dict[str, str] = {}
     for part in (text or "").split(","):
         key, _, value = part.strip().partition(" ")
@@ -191,11 +191,11 @@ async def append(
     threads: Threads,
     silent_s: float = IDLE_TIMEOUT_S,
 ) -> int:
-    """Appends the body of a PATCH to an upload and returns the new offset (bytes). Bytes that arrived stay if the
-    connection breaks or the process is killed.
+    """Appends the body of a PATCH to an upload and returns the new offset (bytes). The bytes that have arrived stay if
+    the connection breaks or the process is killed.
 
-    Raises problems: 460 for a wrong checksum, after removing this body's bytes again; 408 for a client that is silent
-    for ``silent_s`` seconds; 413 for more bytes than were announced; 400 for an unknown kind of checksum.
+    Raises problems: 460 for a wrong checksum, after removing the bytes of the body again; 408 for a client that is
+    silent for ``silent_s`` seconds; 413 for more bytes than were announced; 400 for an unknown kind of checksum.
     """
     path, before = uploads.data(record), uploads.offset(record)
     digest = _digest(checksum)
