@@ -2,7 +2,7 @@
 
 Each vertex of the surface has a height over the closest point of the head. The estimated heights u minimise
 
-    sum_i w_i (d_i - u_i)^2 / (n_i s_i^2)  +  sum_i p_i k_i (u_i / l)^2  +  sum_(i, j) sqrt(k_i k_j) (u_i - u_j)^2,
+    sum_i w_i (d_i - u_i)^2 / (n_i s_i^2)  +  sum_i p_i k_i (u_i / l)^2  +  sum_(i, j) sqrt(k_i k_j) (u_i - u_j)^2.
 
 In this sum d are the measured heights and s their standard deviation, which n neighbours have in common. p is the
 probability of skin, and the stiffness k is the inverse variance of the head's error. With these equations noisy regions

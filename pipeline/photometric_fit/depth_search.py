@@ -3,7 +3,7 @@
 
 The variance of this position is that of a shift between two signals with correlation rho:
 
-    variance = floor^2 + noise area / window area * (1 - rho) / |d^2 rho / d shift^2|,
+    variance = floor^2 + noise area / window area * (1 - rho) / |d^2 rho / d shift^2|.
 
 The variance therefore depends on texture, noise, defocus and oblique views. Gain and offset of a camera have no effect
 on the correlation.
@@ -14,7 +14,7 @@ f_k are the patch's grey values in view k, centred and of unit norm, v_k is the 
 mean of all f_k. Taking T as the mean eliminates the unknown texture exactly, and also any sliding along the surface.
 Linearised in the image shifts delta_k (px) of the views, this cost has the second derivatives H and the gradient
 
-    H_kl = v_k [k = l] <g_k, g_k> - v_k v_l / V <g_k, g_l>,   gradient_k = v_k <g_k, f_k - T>,
+    H_kl = v_k [k = l] <g_k, g_k> - v_k v_l / V <g_k, g_l>,   gradient_k = v_k <g_k, f_k - T>.
 
 In these formulas g_k are the image derivatives and V is the sum of the weights. A displacement u along the normal and
 camera corrections c_k cause the image shifts ``delta_k = p_k u + C_k c_k``. Eliminating u leaves two results: the

@@ -14,7 +14,7 @@ around them.
 
 From one image size to the next, planes are upsampled, pixels take over better planes of their neighbours, and each
 plane moves to the best match. A part of the information from the smaller size is kept, because its larger windows
-contain more shading. The kept part is smaller where the surface has relief, which large windows miss.
+contain more shading. The kept information is smaller where the surface has relief, which large windows miss.
 
 Each view is refined by itself, and all views are compared at the end, so the result does not depend on the order of
 threads.

@@ -134,7 +134,7 @@ class Shown:
 
     def weigh(self, weights: Weights, views: Rig) -> tuple[Weights, UInt8[np.ndarray, " v"]]:
         """Returns the views' weights, set to 0 where the surface is probably hidden, in a view or in the mean of all
-        views. Also returns the part (skin, hair or clothes) from which each unseen vertex takes its colour."""
+        views; also returns the part (skin, hair or clothes) from which each unseen vertex takes its colour."""
         shares = np.zeros((*weights.shape, 3), np.float32)  # read where a view may colour
         for k, camera in enumerate(views):
             shares[k, weights[k] > 0] = self.shares(camera, weights[k] > 0)

@@ -259,8 +259,8 @@ def drawn_onto(
 
 
 def _near_face(points: Float[np.ndarray, "n 3"], model: HeadModel) -> Bool[np.ndarray, " n"]:
-    """Returns a mask of the points of a registered template that lie near the face of the mean head. Points other than
-    skin there belong to the mouth, the nose or the eye sockets."""
+    """Returns a mask of the points of a registered template that lie near the face of the mean head. Points there that
+    show no skin belong to the mouth, the nose or the eye sockets."""
     mean = model.vertices(np.zeros(0))
     return KDTree(mean[model.levels["full"].face_region]).query(points)[0] < FACE_MM
 
