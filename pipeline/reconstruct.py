@@ -35,7 +35,7 @@ def fit_shape(run: Recorder, views: Views, alignment: Alignment) -> tuple[PartLa
 
 
 def reconstruct(context: ReconstructionContext) -> Reconstruction:
-    """Reconstructs a textured head from one capture (paper, section 4). Reads and writes no files.
+    """Reconstructs a textured head from one capture (paper, section 4). The function reads and writes no files.
 
     Raises EigenheadError if no head can be computed, as with too few usable views, or if ``settings.fail_on`` names the
     code of a warning. Raises Cancelled if ``context.progress`` raises it.

@@ -171,7 +171,7 @@ def document_from_settings(settings: Settings) -> dict[str, object]:
 
 
 def _with_present_keys(document: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[Message, ...]]:
-    """Removes or renames the keys of earlier versions in a document. Returns it with warnings about these keys."""
+    """Removes or renames the keys of earlier versions in a document; returns it with warnings about these keys."""
     present, fixed, warnings = dict(document), [], []
     for table, names in FIXED.items():
         if table in present and not names:

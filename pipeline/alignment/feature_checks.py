@@ -1,12 +1,12 @@
 """Checks feature points before a fit: their names, their number of views, whether they span a triangle, and whether
-they lie on the face in the photographs. Also suggests feature points from a detected face, for a person to correct (the
-paper's section 4.2).
+they lie on the face in the photographs. The module also suggests feature points from a detected face, for a person to
+correct (the paper's section 4.2).
 
 For suggestions, the mean head is aligned to the face and deformed to its landmarks, after the detector's mean error has
 been subtracted; landmarks that slide along the surface (jaw line, forehead) are ignored. A view gets a suggested point
 if its face was detected and the head does not hide the point. Suggested points are only as accurate as the face
-detector. On two subjects of the simulated studio, their errors were 1 to 3.5 mm at eyes and mouth, 5 to 6 mm at the tip
-of the nose, and 1 and 12 mm (a beard) at the chin. A person therefore has to check each point."""
+detector. On two subjects of the simulated studio, the suggestions' errors were 1 to 3.5 mm at eyes and mouth, 5 to 6 mm
+at the tip of the nose, and 1 and 12 mm (a beard) at the chin. A person therefore has to check each suggested point."""
 
 from collections.abc import Iterable
 from dataclasses import replace

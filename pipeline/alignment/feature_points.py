@@ -73,7 +73,7 @@ def _consistent(
     pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig, noise_px: float
 ) -> tuple[TriangulatedPoint | None, str | None]:
     """Triangulates a point from all views or, if these contradict each other, from all but one; the second result is
-    the name of the omitted view. Returns (None, None) if no omission of one view helps."""
+    the name of the omitted view. Returns (None, None) if no such omission makes the views agree."""
     point = triangulate(pixels, rig, noise_px=noise_px)
     if _agrees(point, noise_px):
         return point, None

@@ -1,9 +1,9 @@
 """Aligns the head to feature points (the paper's section 4.2): estimates the similarity ``T(x) = s (R x + t')`` from
 the head frame to the world.
 
-The input is picked points, the rig and the head model. The output is world_from_head, and the residual of each point.
-Step 1 is the paper's: full ordinary Procrustes analysis from the mean head's landmarks to the triangulated points,
-which minimises eq. (3). The method departs from the paper in two ways.
+The input is picked points, the rig and the head model. The output of the alignment is world_from_head, and the residual
+of each point. Step 1 is the paper's: full ordinary Procrustes analysis from the mean head's landmarks to the
+triangulated points, which minimises eq. (3). The alignment departs from the paper in two ways.
 
 First, a gross outlier among the points (right and left exchanged) must not rotate the head. The head is therefore
 aligned to every triple of points, and the alignment with which most points agree decides which points are used.

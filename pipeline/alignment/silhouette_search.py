@@ -117,7 +117,7 @@ def start_poses(
     model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig, front: str, *, stated: bool
 ) -> Iterator[Similarity]:
     """Yields the poses from which the search starts: upright, or in quarter turns if the upward direction is unknown;
-    facing the front camera, or in all directions if it is unknown."""
+    facing the front camera, or in all directions if this camera is unknown."""
     forward = rig[front].centre_world - rig.centre_world()
     up = body_up(silhouettes, rig)
     pictures_up = -np.mean([camera.camera_from_world.rotation[1] for camera in rig], axis=0)

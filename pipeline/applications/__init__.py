@@ -1,3 +1,3 @@
 """Works on finished results and on other meshes: templates, wrapping, clinic, verification, model building.
 
-The method imports nothing from here."""
+The reconstruction method imports nothing from this package."""

@@ -1,12 +1,12 @@
 """Caches arrays that depend on the head model alone: the first process computes them, and later processes map the file
 into memory.
 
-Each file in ``cache_folder()/arrays`` holds the arrays of one computation. Its name is the SHA-256 of everything on
-which the arrays depend: the inputs (arrays, settings), the source code, versions, the processor, and the number of BLAS
-threads. (Sums depend on this number, and a head must not depend on which process filled the folder.) Another model,
-setting or version of the code therefore gets another file, and no file becomes outdated. Files are written atomically
-with a checksum, and a damaged file is replaced. If the folder cannot be written, a line in the log says so, and each
-process computes the arrays itself. The arrays are always read-only."""
+Each file in ``cache_folder()/arrays`` holds the arrays of one computation. The name of such a file is the SHA-256 of
+everything on which the arrays depend: the inputs (arrays, settings), the source code, versions, the processor, and the
+number of BLAS threads. (Sums depend on this number, and a head must not depend on which process filled the folder.)
+Another model, setting or version of the code therefore gets another file, and no file becomes outdated. Files are
+written atomically with a checksum, and a damaged file is replaced. If the folder cannot be written, a line in the log
+says so, and each process computes the arrays itself. The returned arrays are always read-only."""
 
 import contextlib
 import hashlib

@@ -8,9 +8,9 @@ read-only; ``4*float64`` is a tuple, ``stereo.matching_kernels:Sight{float64[2C]
 recorded, not written by hand: ``python -m tests.tools.kernel_recorder`` runs jobs and writes it. A test runs a job and
 fails if the list lacks a loop.
 
-The alternative, signatures in the decorators, would be needed in 105 places, mostly for loops that only other loops
-call, and a wrong type in a signature would break a job. Running the whole pipeline during set-up instead would take as
-long as a job in one process."""
+Signatures in the decorators, the alternative to this list, would be needed in 105 places, mostly for loops that only
+other loops call, and a wrong type in a signature would break a job. Running the whole pipeline during set-up instead
+would take as long as a job in one process."""
 
 import importlib
 import re

@@ -1,7 +1,7 @@
 """Runs slices of compiled loops in several threads.
 
 Numba's option ``parallel`` takes five times as long to compile, and its OpenMP threads use CPU time while they wait:
-while another process occupied one of two cores, a fit took 22 s instead of one. This module's threads sleep while they
+while another process occupied one of two cores, a fit took 22 s instead of one. The module's threads sleep while they
 wait, and are reused: starting threads for every loop took a third of a fit's time."""
 
 import os
@@ -34,8 +34,8 @@ def thread_count() -> int:
 
 
 def slice_count(threads: int) -> int:
-    """Returns the largest number of slices into which a loop is divided for this number of threads. It is a power of
-    two, so that more threads only subdivide the same slices."""
+    """Returns the largest number of slices into which a loop is divided for this number of threads. The number of
+    slices is a power of two, so that more threads only subdivide the same slices."""
     return max(SLICES, 1 << (2 * threads - 1).bit_length())
 
 
@@ -43,8 +43,8 @@ def in_threads(count: int, work: Callable[[int, int], None]) -> None:
     """Runs ``work(first, last)`` over slices of ``range(count)`` in several threads. ``work`` is usually a compiled
     loop, which releases Python's interpreter lock.
 
-    The result must not depend on how the range is divided. The calling thread processes slices as well. A helper thread
-    that has not started when no slices remain is cancelled, so that the loop does not wait for it."""
+    The result of ``work`` must not depend on how the range is divided. The calling thread processes slices as well. A
+    helper thread that has not started when no slices remain is cancelled, so that the loop does not wait for it."""
     threads, trace = thread_count(), active_trace()
     if trace is not None:
         _traced(trace, count, work, name_of(work), threads)

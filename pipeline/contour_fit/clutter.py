@@ -55,7 +55,7 @@ def with_bare_crown(
     problem: ContourProblem, evidence: StageEvidence, rim: Rim, length: Float[np.ndarray, " s"], level: str
 ) -> Rim:
     """Restores the weight of a bald crown: rim samples above the brows, in cells marked as bald, get their full
-    ``length``. All other samples stay unchanged."""
+    ``length``. All other outline samples stay unchanged."""
     if evidence.noise.bare is None:
         return rim
     bare = is_crown(problem, rim, level) & within(evidence.noise.bare, rim)

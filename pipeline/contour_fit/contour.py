@@ -1,4 +1,4 @@
-"""Fits a head model to outlines by Levenberg-Marquardt. The paper's section 4.4 uses another cost and a simplex.
+"""Fits a head model to outlines by Levenberg-Marquardt. The paper's section 4.4 uses another cost and a simplex search.
 
 The solver needs the silhouettes' signed distances, a start pose and, if there are any, feature points. The solver
 returns coefficients, pose, camera corrections and their covariance. The modules ``*_term`` give the equations. The
@@ -152,8 +152,8 @@ def coarsened(evidence: StageEvidence, scale_px: float) -> StageEvidence:
     """Returns the evidence for steps with a large scale of the robust loss. The outline's noise l sigma^2 (px^3) is
     raised to match a sigma of half the scale, at a fixed correlation length l.
 
-    With so much noise the prior outweighs the outlines. With less noise, hair over both ears moved the head by 5 mm and
-    its coefficients to 8 standard deviations.
+    With noise of this size the prior outweighs the outlines. With less assumed noise, hair over both ears moved the
+    head by 5 mm and its coefficients to 8 standard deviations.
     """
     unit = max(evidence.noise.unit, FIRST_CORRELATION_PX * (0.5 * scale_px) ** 2)
     return replace(evidence, noise=replace(evidence.noise, unit=unit))
@@ -205,10 +205,10 @@ def finish(solved: ContourSolution) -> Fit:
 def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_mm: float) -> Fit:
     """Returns a fit with an estimate of the shape error that the eigenheads cannot represent.
 
-    Few heads are exact combinations of the eigenheads, and the fit's covariance does not include this error. The error
-    is small at the outlines and several times larger between them. The same outlines are therefore fitted once more
-    with additional modes (``gaussian_process``). The misfit combines the distance between the two fitted heads with the
-    uncertainty of the second one.
+    Few heads are exact combinations of the eigenheads, and the fit's covariance does not include the deviation. The
+    shape error is small at the outlines and several times larger between them. The head's outlines are therefore fitted
+    once more with additional modes (``gaussian_process``). The misfit combines the distance between the two fitted
+    heads with the uncertainty of the second one.
 
     Args:
         solved: solution with the eigenheads alone.

@@ -70,9 +70,9 @@ def makes_face(coefficients: Float[np.ndarray, " m"], posed: range) -> bool:
 
 
 def doubtful_weights(model: HeadModel, coefficients: Float[np.ndarray, " m"]) -> frozenset[int]:
-    """Returns the indices of expressions that probably explain noise or an unusual shape. Such expressions are pairs of
-    strong opposite expressions, or have a weight at the upper bound. Expressions of the lids are never returned,
-    because the lids are measured elsewhere."""
+    """Returns the indices of expressions that probably explain noise or an unusual shape. Doubtful expressions are
+    pairs of strong opposite expressions, or have a weight at the upper bound. Expressions of the lids are never
+    returned, because the lids are measured elsewhere."""
     weights = coefficients[model.posed.start : model.posed.stop]
     found = [np.flatnonzero(weights > BOUND)]
     strong = np.flatnonzero(weights > STRONG)

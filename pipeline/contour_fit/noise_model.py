@@ -46,8 +46,8 @@ def with_clutter_of_start(
     """Marks clutter before the first fit: wherever the silhouette reaches more than ``START_CLUTTER_MM`` beyond the
     mean head at the start pose.
 
-    Long hair beside a face is wider than any face. The fit would follow the hair before its residuals could show that
-    it is hair.
+    Long hair beside a face is wider than any face. A fit without these marks would follow hair before its residuals
+    could show the hair.
     """
     rim = observed_rim(problem, evidence, state, stage)
     depths = [camera.camera_from_world.apply(state.world_from_head.translation)[2] for camera in problem.rig]
@@ -61,7 +61,7 @@ def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float |
     None if the settings give both the noise sigma and the correlation length l.
 
     The mean residual over a block of B px of outline has the variance l sigma^2 / B if B is well above the correlation
-    length l. Therefore the correlation length l need not be known. Residuals of ``most_px`` and more are left out.
+    length l. The correlation length l need not be known. Residuals of ``most_px`` and more are left out.
     """
     stated = problem.settings
     if stated.contour_noise_px is not None and stated.contour_correlation_px is not None:

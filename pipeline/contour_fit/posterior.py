@@ -6,10 +6,10 @@ of another population by its double. ``with_estimated_prior`` therefore estimate
 coefficients that the photographs determine (the evidence framework; MacKay 1992, *Bayesian interpolation*,
 https://doi.org/10.1162/neco.1992.4.3.415).
 
-Two errors that no coefficient describes are added to the standard deviation. The kernel moves the surface along its
-normals only, but landmarks of real heads also shift along the surface. The shift along the surface gets the standard
-deviation that the kernel has along the normal (``Fit.sliding_mm``). The second additional error is relief finer than
-the modes. A fit of eigenheads alone contains neither error (see ``with_span_misfit``).
+Two errors that no shape coefficient describes are added to the standard deviation. The kernel moves the surface along
+its normals only, but landmarks of real heads also shift along the surface. The shift along the surface gets the
+standard deviation that the kernel has along the normal (``Fit.sliding_mm``). The second additional error of a vertex is
+relief finer than the modes. A fit of eigenheads alone contains neither error (see ``with_span_misfit``).
 """
 
 import math
@@ -93,7 +93,7 @@ def vertex_deviation_mm(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v"]:
 
 def cage_variance(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v0"]:
     """Returns the variance (mm^2) along the normals at the vertices of the coarse mesh (the cage), including relief
-    finer than the modes. The fit must have a covariance."""
+    finer than the modes. The head's ``fit`` must have a covariance."""
     assert fit.covariance is not None
     rows = normal_rows(model, fit)
     # One triangular factor instead of rows @ covariance twice; the jitter keeps rounding from making it indefinite.

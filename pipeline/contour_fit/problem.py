@@ -84,7 +84,7 @@ class LevelBasis:
     level's vertices.
 
     A decimated mesh stores its modes at its own vertices (2 MB), and its operator is the identity. The full mesh stores
-    its modes at the vertices of a coarse mesh (the cage), since its own would take 40 to 170 MB.
+    its modes at the vertices of a coarse mesh (the cage), since modes at all its vertices would take 40 to 170 MB.
     """
 
     operator: sparse.csr_array

@@ -4,7 +4,7 @@ For a surface point X with normal N and a camera centre C_k, the rim is where ``
 (X - C_k)`` is interpolated along mesh edges to find the zero crossing. A rim point is on the *outer* outline if a step
 outwards leaves the model's mask. Instead of a drawn mask, the test uses the mesh's silhouette edges, between
 front-facing and back-facing faces (counted twice), and its border edges (counted once). The winding number of these
-edges around a pixel is the number of faces over the pixel. A test visits only the edges that cross one image row.
+edges around a pixel is the number of faces over the pixel. Each test visits only the edges that cross one image row.
 
 The tangent plane at the rim contains the viewing ray. With P = d(pixel)/dX the outline's normal in the image is
 therefore ``n = l / |l|, l = N^T P^+``, and ``n^T P = N^T / |l|``. A shift of the rim along the surface has no effect to
@@ -142,8 +142,8 @@ def find_rim(
     """Finds samples of a mesh's outer outline in every view, and reads the silhouette's signed distance (px) at each.
 
     With ``whole_head`` cranium and ears are searched too; otherwise only the face region. If ``averaged``, each
-    distance is a mean along the outline, half way to the two neighbouring samples. The mean is meant for meshes with
-    edges of 2 to 6 px in the image.
+    distance is a mean along the outline, half way to the two neighbouring samples. The mean distance is meant for
+    meshes with edges of 2 to 6 px in the image.
     """
     faces = topology.head if whole_head else topology.face
     vertices = np.ascontiguousarray(vertices_world)
@@ -170,8 +170,8 @@ def _outlines(
     """Returns, for each of at most ``VIEWS_A_WORD`` views, the rim samples and the end points of their mesh edges;
     ``rim_kernels`` names the samples' columns.
 
-    One pass over faces and vertices serves all views, with one bit for each view. Afterwards each view only visits the
-    faces on its rim.
+    A single pass over the mesh's faces and vertices serves all views, with one bit for each view. After the common pass
+    each view only visits the faces on its rim.
     """
     centres = -np.einsum("kji,kj->ki", views.rotation[some], views.translation[some])
     pictures = Pictures(views.packed()[some], centres, views.size[some], views.distance, views.offset[some])

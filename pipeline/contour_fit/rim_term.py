@@ -33,8 +33,8 @@ OUTSIDE_SCALE = 2.0  # robust scale where the model sticks out of the input, by 
 
 
 def observed_rim(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> Rim:
-    """Returns the rim of the head at ``state``, with weights of its samples from ``stage`` and ``evidence``. Samples in
-    clutter have length 0."""
+    """Returns the rim of the head at ``state``, with weights of its samples from ``stage`` and ``evidence``. Outline
+    samples in clutter have length 0."""
     vertices = state.world_from_head.apply(problem.bases[stage.level].vertices(state.coefficients))
     # On a decimated mesh a sample's share of the outline is long enough to be half clutter: it would hide what is not.
     fine, whole = stage.level == "full", stage.whole_head or stage.contained

@@ -1,7 +1,7 @@
 """Assigns each measured surface point to the closest point of the head with a similar normal.
 
-The search goes from the measured points to the head. Thus parts of the head without measured points, and the borders of
-such holes, get no observation.
+The search for pairs goes from the measured points to the head. With this direction, parts of the head without measured
+points, and the borders of such holes, get no observation.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,8 @@
 """Estimates from the measured surface how far the eyelids are closed.
 
 The photometric fit uses patches of a few millimetres, which cannot follow a lid, so it leaves lids open. The colours
-between the lids (``eyelids``) mislead for eyes whose white is hidden. So a few weights of the blink expression are
-tested for each eye, and the weight with the smallest robust distance between lids and surface points is chosen.
+between the lids (``eyelids``) mislead for eyes whose white is hidden. Therefore a few weights of the blink expression
+are tested for each eye, and the weight with the smallest robust distance between lids and surface points is chosen.
 """
 
 from collections.abc import Mapping
@@ -46,8 +46,8 @@ def blinks_of(model: HeadModel) -> dict[str, int]:
 def estimate_eyelid_closure(
     fit: Fit, model: HeadModel, base: Vertices, surface: SurfacePoints, eyes: Mapping[str, EyeEvidence]
 ) -> tuple[dict[str, float], frozenset[str]]:
-    """Estimates how far each eye is closed (0 open, 1 closed), if the model has a blink for it. Also returns eyes that
-    look closed although no blink brings the lids nearer to the points; their lids must be bridged.
+    """Estimates how far each eye is closed (0 open, 1 closed), if the model has a blink for it. The function also
+    returns eyes that look closed although no blink brings the lids nearer to the points; their lids must be bridged.
 
     Args:
         fit: the head fitted to the photographs.
@@ -107,8 +107,8 @@ def _nearest_closure(
     open_lids: Vertices, moved: Vertices, fitted: float, model: HeadModel, surface: SurfacePoints, slit: Fissure
 ) -> tuple[float, float]:
     """Returns the blink weight with the smallest distance between lids and points, or ``fitted`` if no weight is
-    better. Also returns the misfit of half-closed lids divided by the misfit of open lids. Without enough points the
-    function returns ``fitted`` and 1.
+    better. The function also returns the misfit of half-closed lids divided by the misfit of open lids. Without enough
+    points near the lids the function returns ``fitted`` and 1.
 
     ``moved`` is the displacement (mm) of the lids by a full blink.
     """
@@ -141,8 +141,8 @@ def _patch(
 
 
 def _misfit(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], points: SurfacePoints) -> float:
-    """Returns the mean of Geman and McClure's loss (0 to 1) over the points' distances to the mesh. A point too far
-    from the mesh counts as 1."""
+    """Returns the mean of Geman and McClure's loss (0 to 1) over the points' distances to the mesh. The distance of a
+    point too far from the mesh counts as 1."""
     target = Target.of(vertices, vertex_normals(vertices, faces), faces)
     found = target.closest(points.points, points.normals, reach_mm=REACH_MM, least_agreement=AGREEMENT)
     loss = np.ones(len(points.points))

@@ -1,9 +1,9 @@
 """Moves each ear of the head by a similarity transform, before the head is deformed.
 
 An ear may be a centimetre away from its predicted position, and has many folds, so closest points may lie on the wrong
-fold. So each ear first moves by a similarity, found by iterated closest points along the normals (Chen and Medioni
-1992). The search has several starts, and the result with the best fit to the surface points is kept. The skin around
-the ear follows smoothly.
+fold. Therefore each ear first moves by a similarity, found by iterated closest points along the normals (Chen and
+Medioni 1992). The search has several starts, and the result with the best fit to the surface points is kept. The skin
+around the ear follows smoothly.
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class Motion:
 
 
 def with_ears_in_place(vertices: Vertices, model: HeadModel, surface: SurfacePoints) -> Vertices:
-    """Returns the head with each ear moved to the skin points near it. An ear with too few points does not move.
+    """Returns the head with each ear moved to the skin points near it. An ear with too few measurements does not move.
 
     Args:
         vertices: full mesh, world frame, mm.

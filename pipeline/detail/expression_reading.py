@@ -1,17 +1,17 @@
 """Estimates the expression of a face from the deformed head.
 
 The fit estimates expression weights with few eigenheads, from a surface that is exact to half a millimetre only. Shape
-that few eigenheads cannot represent then looks like an expression, mostly at the brows and the wings of the nose. So
-this module estimates the weights and their standard deviations again, from the deformed head (``refine``) and with all
-eigenheads of the population. With X a point of the head, Y the same point on the deformed head and n its normal,
+that few eigenheads cannot represent then looks like an expression, mostly at the brows and the wings of the nose. This
+module therefore estimates the weights and their standard deviations again, from the deformed head (``refine``) and with
+all eigenheads of the population. With X a point of the head, Y the same point on the deformed head and n its normal,
 
-    n . (mean + sum_m z_m modes_m + sum_e w_e shapes_e + pose - Y) = noise,    z ~ N(0, 1),
+    n . (mean + sum_m z_m modes_m + sum_e w_e shapes_e + pose - Y) = noise,    z ~ N(0, 1).
 
-is solved for z, w and the pose with a robust loss. The variance of the kernel's modes is estimated too, since with all
-eigenheads little deviation is left for them. The expression weights have the same prior and bounds as in the fit
-(``prior_term``). The point Y is the closest point on the deformed head, so a shift along the surface has no cost. The
-module does not change the head's vertices. For a head outside the population expressions would replace missing
-eigenheads, so the fit's weights are kept.
+The equation is solved for z, w and the pose with a robust loss. The variance of the kernel's modes is estimated too,
+since with all eigenheads little deviation is left for them. The expression weights have the same prior and bounds as in
+the fit (``prior_term``). The point Y is the closest point on the deformed head, so a shift along the surface has no
+cost. The module does not change the head's vertices. For a head outside the population expressions would replace
+missing eigenheads, so the fit's weights are kept.
 """
 
 from dataclasses import dataclass, replace

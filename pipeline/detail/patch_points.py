@@ -3,7 +3,7 @@
 Dense matching uses planar windows, so curved skin comes out too flat and too deep (``pipeline.stereo.depth_map``). A
 patch of the deformed head (``pipeline.photometric_fit.patches``) has the surface's shape, so it warps correctly into
 all its views. The patches are narrower than in the fit, and correct the surface by tenths of a millimetre. Where no
-patch matches, the dense points are used.
+patch of the head matches, the dense stereo points are used.
 """
 
 from collections.abc import Mapping

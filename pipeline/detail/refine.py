@@ -2,12 +2,12 @@
 
 The displacement of the full mesh's vertices is a smooth random field (``smooth_field``), whose prior standard deviation
 is the uncertainty of the fit. Each measured point of skin pulls the closest point of the head along the normals
-(``association``), with a robust loss. Where there are no points, the head retains the fit's shape. The result also has
-a standard deviation for each vertex.
+(``association``), with a robust loss. Where no surface was measured, the head retains the fit's shape. The deformed
+head also has a standard deviation for each vertex.
 
 The deformation runs in rounds from coarse to fine. In the first rounds the control points move freely and far, which
-brings ears and jaw into position. Then the vertices move only along their normals, so that a vertex remains the same
-anatomical point on every subject. Points of hair and clothes only bound the skin from outside.
+brings ears and jaw into position. In the later rounds the vertices move only along their normals, so that a vertex
+remains the same anatomical point on every subject. Points of hair and clothes only bound the skin from outside.
 """
 
 from collections.abc import Callable, Mapping
@@ -86,8 +86,8 @@ PATCH_REACH_MM = 4.0  # no dense point counts so near to a patch, whose window r
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointObservations:
-    """Holds the observations of the head from surface points. Also holds, for the n points of skin, the triangle on the
-    head (corners and barycentric coordinates) and the standard deviation."""
+    """Holds the observations of the head from surface points. The class also holds, for the n points of skin, the
+    triangle on the head (corners and barycentric coordinates) and the standard deviation."""
 
     observed: Observed
     corner: Int[np.ndarray, "n 3"]

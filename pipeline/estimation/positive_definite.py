@@ -1,5 +1,5 @@
 """Inverts symmetric positive definite matrices by their Cholesky factor, which takes half the work of a general
-inverse, and a third for the diagonal alone. Both functions raise LinAlgError if the matrix is not positive definite."""
+inverse, and a third for the diagonal alone. Each function raises LinAlgError if the matrix is not positive definite."""
 
 import numpy as np
 import scipy.linalg

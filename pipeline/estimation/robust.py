@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 @runtime_checkable
 class Loss(Protocol):
-    """Describes a robust loss rho. Both methods take squared residuals s, in squared standard deviations, and return
-    one value for each of them."""
+    """Describes a robust loss rho. The methods of a loss take squared residuals s, in squared standard deviations, and
+    return one value for each of them."""
 
     def cost(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Returns the loss rho(s) of each squared residual s."""

@@ -4,8 +4,8 @@ A term at a given value has a cost and adds its contribution to the normal equat
 
     matrix += J^T W J,    gradient += J^T W r,
 
-Here W is the information times the robust weight; the gradient is half of the cost's gradient. ``Residuals`` is the
-usual form of a term, with a Jacobian; a term whose Jacobian is too large to store adds its blocks directly."""
+The matrix W is the information times the robust weight; the gradient is half of the cost's gradient. ``Residuals`` is
+the usual form of a term, with a Jacobian; a term whose Jacobian is too large to store adds its blocks directly."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -106,8 +106,8 @@ class Linear:
 @dataclass(frozen=True, slots=True, eq=False)
 class Quadratic:
     """Holds the quadratic form ``(x - c)^T M (x - c) - 2 g^T (x - c)`` of a vector x, with ``matrix`` M, ``centre`` c
-    and ``pull`` g (towards the minimum). With g = 0 it is a Gaussian prior. The form can also represent another problem
-    after all of its unknowns except x have been eliminated."""
+    and ``pull`` g (towards the minimum). With g = 0 the term is a Gaussian prior. The form can also represent another
+    problem after all of its unknowns except x have been eliminated."""
 
     matrix: Float[np.ndarray, "p p"]
     centre: Float[np.ndarray, " p"]

@@ -3,18 +3,18 @@
 A landmark is a vertex of the model's full mesh, with the position ``x = s R (h0 + sum_m z_m h_m) + t`` (the paper's eq.
 1). The landmark's derivatives are ``s R h_m`` by a coefficient, ``-[x - t]x`` by a rotation about the head's origin,
 the identity by the translation, and ``x - t`` by log scale. A distance has ``var = g C g^T``, where g is its gradient
-and C the fit's covariance. Rotation and translation do not change a distance.
+and C the fit's covariance. Rotation and translation of the head do not change a distance between landmarks.
 
 Outlines and photographs of skin hardly determine a landmark's position along the surface. The eigenheads determine this
-position, but most heads are not exact combinations of eigenheads. So a landmark has the standard deviation
+position, but most heads are not exact combinations of eigenheads. Therefore a landmark has the standard deviation
 ``Fit.sliding_mm`` in every direction of its tangent plane. The kernel of ``gaussian_process`` gives the correlation of
 two landmarks, which decreases with their distance.
 
 Definitions follow Farkas, *Anthropometry of the Head and Face* (1994). Head length and breadth need three more points
 on the fitted head. The opisthocranion is the point of the back of the head farthest from the glabella in the
-midsagittal plane; the euryons are the most lateral points of the skull above the ears. Length and breadth are extremal
-at these points, so to first order their variance does not depend on the exact points. Face-only models have no head
-length and breadth.
+midsagittal plane; the euryons are the most lateral points of the skull above the ears. Head length and breadth are
+extremal at these three points, so to first order their variance does not depend on the exact points. Face-only models
+have no head length and breadth.
 """
 
 from collections.abc import Mapping
@@ -84,8 +84,8 @@ class Measurement:
 
 def landmarks(model: HeadModel, fit: Fit, vertices: Vertices | None = None) -> dict[str, Landmark]:
     """Returns the model's landmarks on the fitted head, world frame, mm. If the head was deformed after the fit,
-    ``vertices`` is the final head (full mesh, world frame, mm). The standard deviations are always computed from the
-    fit."""
+    ``vertices`` is the final head (full mesh, world frame, mm). The measurements' standard deviations are always
+    computed from the fit."""
     names = list(model.landmarks)
     index = np.array([model.landmarks[name] for name in names])
     points, jacobian = _points(model, fit, index)

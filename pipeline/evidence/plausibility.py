@@ -1,4 +1,4 @@
-"""Checks whether a finished fit is plausible. Each check has its own warning code.
+"""Checks whether a finished fit is plausible. Each check of plausibility has its own warning code.
 
 The checks only add warnings to a result; ``settings.fail_on`` names the codes that become failures. The comments on the
 thresholds give the values of two good captures: a real scan with closed eyes and hair (scale 1.024), and a random head

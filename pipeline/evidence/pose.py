@@ -118,8 +118,8 @@ def cameras_in_front(world_from_head: Similarity, rig: Rig, least: float = MIN_F
 
 
 def _seen(subject: SubjectFaces) -> dict[str, tuple[FaceDetection, ...]]:
-    """Returns the subject's face in each camera. If the views agree on no face, it returns all faces of each view, or
-    none if too few views have a certain face."""
+    """Returns the subject's face in each camera. If the views agree on no face, the function returns all faces of each
+    view, or none if too few views have a certain face."""
     if subject.matched is None:
         seen = {name: faces for name, faces in subject.found.items() if faces}
         doubtful = len(seen) < MIN_VIEWS and all(f.score < CERTAIN_SCORE for faces in seen.values() for f in faces)
@@ -157,6 +157,6 @@ def pupil_distance(eyes: Mapping[str, Iris | UnseenEye]) -> Measurement | None:
 
 def angles_deg(direction: Float[np.ndarray, " 3"]) -> tuple[float, float]:
     """Returns the azimuth (from z towards x) and elevation (towards y) of a unit vector, degrees. In the head frame
-    azimuth is to the subject's left."""
+    positive azimuth is to the subject's left."""
     x, y, z = direction
     return float(np.degrees(np.arctan2(x, z))), float(np.degrees(np.arcsin(np.clip(y, -1.0, 1.0))))

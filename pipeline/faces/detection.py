@@ -120,7 +120,7 @@ class FaceDetection:
 
 def find_faces(image: ImageRgb, networks: FaceNetworks) -> tuple[FaceDetection, ...]:
     """Finds the faces in a picture, the best score first. Faces larger than an eighth of the picture's longer side are
-    searched first. If no such face is found, faces down to a sixteenth of this side are searched."""
+    searched first. If no face of at least an eighth is found, faces down to a sixteenth of this side are searched."""
     pyramid = make_pyramid(image)
     return find_large_faces(pyramid, networks) or find_small_faces(pyramid, networks)
 
@@ -140,7 +140,7 @@ def find_face_at(
     pyramid: Pyramid, crop: Crop, networks: FaceNetworks, *, min_rounds: int = MIN_ROUNDS
 ) -> FaceDetection:
     """Places the 468 points on the face in a crop. The crop is centred on the points again until they no longer change.
-    The result's score is high only for a face."""
+    The score is high only if the crop shows a face."""
     for count in range(MAX_ROUNDS):
         points, _ = _place(pyramid, crop, networks)
         before, crop = crop, crop_around(points)

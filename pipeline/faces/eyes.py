@@ -26,7 +26,7 @@ MIN_HALF_OPENING, MAX_CLOSED_OPENING = 0.095, 0.1  # of lids that are half close
 
 
 def find_eyes(pyramid: Pyramid, face: FaceDetection, networks: FaceNetworks) -> FaceDetection:
-    """Adds irises and lid edges (px of the picture) to a detected face. Both eyes must be visible."""
+    """Adds irises and lid edges (px of the picture) to a detected face. Both eyes of the face must be visible."""
     right = _place(pyramid, face.landmarks_px[list(RIGHT_EYE_CORNERS)], networks, mirrored=False)
     left = _place(pyramid, face.landmarks_px[list(LEFT_EYE_CORNERS)], networks, mirrored=True)
     lids, irises = (np.concatenate(pair) for pair in zip(right, left, strict=True))

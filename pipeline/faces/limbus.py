@@ -45,8 +45,8 @@ class EyeView:
 
 
 def eye_view(camera: Camera, image: ImageRgb, lids_px: Float[np.ndarray, "16 2"]) -> EyeView | None:
-    """Cuts an eye out of a picture. ``lids_px`` are the edges of its lids, in the order of ``FaceDetection``. Returns
-    None if the eye lies outside the picture."""
+    """Cuts an eye out of a picture. ``lids_px`` are the edges of the eye's lids, in the order of ``FaceDetection``.
+    Returns None if the eye lies outside the picture."""
     height, width = image.shape[:2]
     half = CROP * 0.5 * float(np.linalg.norm(lids_px[8] - lids_px[0]))
     middle = lids_px.mean(axis=0)

@@ -2,8 +2,8 @@
 
 Every two detections that may show the same face are triangulated. The triangulated face must have the size (mm) and the
 relief of a face (a poster is flat), and be turned towards its cameras. Further views are added if the points project
-onto their detections. If there are several faces, the subject's is the largest and most central one, since bystanders
-stand behind.
+onto their detections. If the pictures show several faces, the subject's is the largest and most central one, since
+bystanders stand behind.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -122,7 +122,7 @@ def _consistent(
 def _may_be_one(
     pair: Sequence[tuple[str, FaceDetection]], rig: Rig, eye_distance_mm: tuple[float, float] | None
 ) -> bool:
-    """Returns True if the viewing rays of two detections meet in points of a face's size. A test takes 0.3 ms."""
+    """Returns True if the viewing rays of two detections meet in points of a face's size. Each call takes 0.3 ms."""
     (centre, ray), (other, other_ray) = (
         (rig[name].centre_world, rig[name].rays_world(face.landmarks_px[FEW_POINTS])) for name, face in pair
     )

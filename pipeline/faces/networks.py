@@ -2,12 +2,12 @@
 
 BlazeFace (Bazarevsky et al. 2019) finds faces. The network of Kartynnik et al., *Real-time facial surface geometry from
 monocular video on mobile GPUs* (2019), places 468 points on a face. The network of Ablavatski et al., *Real-time pupil
-tracking from monocular video for digital puppetry* (2020), places the lids and the iris of an eye. The files are in
-``packs`` (Apache-2.0), and their sha256 is checked. OpenCV's classic engine is used, since the new engine of version
-5.0 returns only one output of a network.
+tracking from monocular video for digital puppetry* (2020), places the lids and the iris of an eye. The networks' files
+are in ``packs`` (Apache-2.0), and their sha256 is checked. OpenCV's classic engine is used, since the new engine of
+version 5.0 returns only one output of a network.
 
-Pixel (0, 0) of a network's input is the centre of its top-left pixel. A measurement confirmed this: the x of a point
-and of its mirror image add up to 190.8 px, and 191 px are expected.
+Pixel (0, 0) of a network's input is the centre of its top-left pixel. A measurement confirmed this pixel position: the
+x of a point and of its mirror image add up to 190.8 px, and 191 px are expected.
 """
 
 import hashlib
@@ -47,7 +47,7 @@ class DamagedNetwork(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceNetworks:
-    """Holds the three loaded networks. Several threads may share them: a lock runs one network at a time."""
+    """Holds the three loaded networks. Several threads may share the networks: a lock runs one network at a time."""
 
     finder: cv2.dnn.Net
     landmark: cv2.dnn.Net
@@ -55,7 +55,7 @@ class FaceNetworks:
     _lock: Any = field(default_factory=threading.Lock, repr=False)
 
     def find(self, crop: UInt8[np.ndarray, "192 192 3"]) -> tuple[Float[np.ndarray, "n 8 2"], Float[np.ndarray, " n"]]:
-        """Proposes a face for every cell of the 192 x 192 crop. Most proposals are wrong and have a low score.
+        """Proposes a face for every cell of the 192 x 192 crop; most proposals are wrong and have a low score.
 
         Returns:
             For each cell a face's centre, width and height, right eye, left eye, tip of the nose, mouth, right and left

@@ -70,8 +70,8 @@ def place_face(points_world: Float[np.ndarray, "n 3"], which: slice = slice(None
     """Fits the mean face to the points with the indices ``which``. Returns the face's pose and scale (world_from_face),
     and the relief.
 
-    The scale is fitted to breadth and height only. The relief is the depth of the points divided by the mean face's
-    depth; a flat picture has 0.
+    The face's scale is fitted to breadth and height only. The relief is the depth of the points divided by the mean
+    face's depth; a flat picture has 0.
     """
     shape = point_table().shape_mm[which]
     mean, middle = shape.mean(axis=0), points_world.mean(axis=0)

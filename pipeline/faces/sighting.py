@@ -65,7 +65,7 @@ def turned_deg(world_from_face: Similarity, rig: Rig, front: str) -> tuple[float
 
 def _turned(from_front_deg: float, from_middle_deg: float) -> float:
     """Returns the angle from the front camera, or 0 if the face looks between the front camera and the middle of all
-    cameras. In a rig with rows of cameras, the front camera is above or below this middle."""
+    cameras. In a rig with rows of cameras, the front camera is above or below the middle of all cameras."""
     agreed = from_front_deg * from_middle_deg > 0.0 and abs(from_middle_deg) >= MIN_OFF_MIDDLE_DEG
     return from_front_deg if agreed else 0.0
 

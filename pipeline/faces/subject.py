@@ -191,8 +191,8 @@ def _matched_alone(found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> 
 def _search_missing(
     scene: _Scene, face: TriangulatedFace, found: Mapping[str, tuple[FaceDetection, ...]]
 ) -> dict[str, tuple[FaceDetection, ...]]:
-    """Searches the face in views that must show it but have no detection of it. New detections come first in their
-    view."""
+    """Searches the face in views that must show it but have no detection of it. Newly detected faces come first in the
+    list of their view."""
     added = {}
     points = face.world_from_face.apply(point_table().shape_mm)
     for name in _expected(face.world_from_face, scene.rig, scene.effort.min_facing):

@@ -1,7 +1,7 @@
 """Triangulates a face's points from its detections in several views.
 
-The landmark network has a bias that depends on the viewing direction (``points.view_bias``). The bias is subtracted
-once the face's pose is known. The more a point turns away from a camera, the larger is its noise.
+The landmark network has a bias that depends on the viewing direction (``points.view_bias``). The bias of the detector
+is subtracted once the face's pose is known. The more a point turns away from a camera, the larger is its noise.
 """
 
 from collections.abc import Mapping, Sequence

@@ -30,8 +30,8 @@ def crossing_faces(
 
 
 def _crossing_by_size(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
-    """Returns a mask of triangles that cross another triangle. For speed the triangles are divided into size classes.
-    Each class is tested against itself and all smaller triangles in a grid with cells of its own size.
+    """Returns a mask of triangles that cross another triangle. To make this fast, the mesh's triangles are divided into
+    size classes. Each class is tested against itself and all smaller triangles in a grid with cells of its own size.
     """
     boxes, crossing = triangle_boxes(vertices, faces), np.zeros(len(faces), bool)
     wide = (boxes[:, 3:] - boxes[:, :3]).max(axis=1)
@@ -65,7 +65,7 @@ def _crossing(
 @traced
 def without_coincidences(mesh: Mesh) -> Mesh:
     """Separates vertices that coincide in single precision, as files store them, by a small move towards the mean of
-    their neighbours. Without this, a program that merges vertices by position would join separate sheets of the
+    their neighbours. Without this shift, a program that merges vertices by position would join separate sheets of the
     surface."""
     stored = mesh.vertices.astype(np.float32)
     order = np.argsort(stored[:, 0])  # only what is equal there is sorted by all coordinates: a tenth of the time

@@ -2,7 +2,7 @@
 
 A signed distance is computed on a grid (``signed_distance``), and its zero level becomes a mesh (``surface_nets``). The
 vertices are moved to the depth maps (``refinement``) and to the fitted head (``skin``); hair is moved to its outlines
-(``hair``). At last flipped, folded or intersecting triangles are repaired (``untangling``)."""
+(``hair``). As the last step, flipped, folded or intersecting triangles are repaired (``untangling``)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

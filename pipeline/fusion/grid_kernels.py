@@ -7,7 +7,7 @@ the result does not depend on the order of threads.
 A surface net (``pipeline.geometry.surface_nets``) is a manifold exactly if the set of inside nodes is well composed
 (Latecki, *3D well-composed pictures*, 1997). In a well-composed set no square of four nodes has inside nodes on one
 diagonal and outside nodes on the other, and no cell has two opposite corners that differ from its six others. The signs
-of single nodes are changed until both conditions hold.
+of single nodes are changed until the set of inside nodes is well composed.
 """
 
 from typing import NamedTuple
@@ -173,7 +173,7 @@ def relax(
 @njit(cache=True, nogil=True)
 def compose_well(field: np.ndarray, neighbours: np.ndarray, outer: np.ndarray, least: float) -> int:
     """Changes signs in ``field`` (n; mm, negative inside), in place, until the set of inside nodes is well composed. A
-    changed node gets the value ``least`` or -``least``. Returns the number of changes.
+    changed node of the grid gets the value ``least`` or -``least``. Returns the number of changed nodes.
 
     ``neighbours`` (n, 6) has the indices of adjacent nodes, -1 for none. ``outer`` nodes (n) are never changed, since
     the surface would then leave the grid.

@@ -1,13 +1,13 @@
 """Smooths the surface of hair, and handles long hair whose depth cannot be measured.
 
 In hair, dense matching finds chance patterns of strands. The depth of hair therefore scatters over millimetres, and the
-fused surface would be rough, with pockets and handles. So depth of hair gets a small weight in the signed distance
-(``loosened``), and hair vertices are smoothed. Matching also looks through strands to the dense core of the hair or to
-the scalp. So at the silhouettes' rims hair is moved outwards until it is as far inside all silhouettes as visible
-strands. Hair with a smooth surface has depth nearly everywhere, and is not changed.
+fused surface would be rough, with pockets and handles. Therefore depth of hair gets a small weight in the signed
+distance (``loosened``), and hair vertices are smoothed. Matching also looks through strands to the dense core of the
+hair or to the scalp. Therefore hair at the silhouettes' rims is moved outwards until it is as far inside all
+silhouettes as visible strands. Hair with a smooth surface has depth nearly everywhere, and is not changed.
 
-Long hair often has hardly any measured depth. Such hair is modelled as a smooth shell inside the visual hull, whose
-distance from the hull is estimated from the few measured points.
+Long hair often has hardly any measured depth. Long hair without depth is modelled as a smooth shell inside the visual
+hull, whose distance from the hull is estimated from the few measured points.
 """
 
 from collections.abc import Mapping, Sequence
@@ -85,8 +85,7 @@ def find_silent_hair(
         votes: part labels of the depth maps' points (``parts_over_head``); None means that no long hair is searched.
         rig: the cameras as calibrated, world frame.
 
-    Returns:
-        The measured points (world frame, mm) of such hair, or None; the depth maps without this hair, or with less
+    Returns: The measured points (world frame, mm) of long hair, or None; the depth maps without this hair, or with less
         weight for hair that scatters; and the noise fraction (0 to 1) of the depth of hair.
     """
     known = known_share(depth_maps, parts, rig)
@@ -313,7 +312,7 @@ def grown_to_outlines(
 def depth_inside_outlines(
     places: Places, normals: Places, silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Returns the depth (mm, at least 0) of points inside all silhouettes; 0 if no silhouette bounds them. Also returns
+    """Returns the depth (mm, at least 0) of points inside all silhouettes; 0 if no silhouette bounds them; also returns
     the largest cosine between their normals and the directions to cameras, and the smallest absolute cosine."""
     inside_mm, cosines = np.full(len(places), np.inf), np.zeros((len(rig), len(places)))
     for k, camera in enumerate(rig):

@@ -64,7 +64,7 @@ def _offsets(
 ) -> tuple[Float[np.ndarray, "2 v"], Float[np.ndarray, "2 v"]]:
     """Returns the offsets (mm) of the seen surface from the head and from the hull around each vertex of the head, and
     their mean squares (mm^2). The offsets are extrapolated from vertices near seen points by inverse squared distances.
-    With too few points only the head is used, with offset 0."""
+    With too few measured points only the head is used, with offset 0."""
     vertices = tree.points
     far, near = nearest(tree, seen.points, within=THICKEST_MM)
     within = np.isfinite(far)

@@ -1,5 +1,5 @@
-"""Moves the vertices of the fused surface to the depth maps, which restores detail finer than the grid. Also computes
-the standard deviation of each vertex, and which vertices are measured."""
+"""Moves the vertices of the fused surface to the depth maps, which restores detail finer than the grid. The module also
+computes the standard deviation of each vertex, and which vertices are measured."""
 
 from dataclasses import dataclass, replace
 

@@ -7,7 +7,7 @@ At every node each view contributes the distance to the surface that it sees, an
 the requested spacing; each finer level has nodes only near the surface of the coarser level.
 
 The method follows Curless and Levoy, *A volumetric method for building complex models from range images*, SIGGRAPH
-1996. In this module the views are combined robustly, and silhouettes are inequality constraints.
+1996. Other than in their method, views are combined robustly, and silhouettes are inequality constraints.
 """
 
 from collections.abc import Sequence
@@ -301,8 +301,8 @@ def _box(
 
 
 def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface, cut: Cut) -> Field:
-    """Returns the start value of the signed distance. The start value is the measured distance where views certainly
-    see the surface, and elsewhere the distance to the surface predicted from visual hull and head."""
+    """Returns the signed distance from which the relaxation starts. The start value is the measured distance where
+    views certainly see the surface, and elsewhere the distance to the surface predicted from visual hull and head."""
     prior = np.maximum(votes.value, votes.bound).astype(float)
     if head_world is not None:
         weak = (votes.weight > 0) & (votes.weight < WEAK) & (votes.bound < 0)

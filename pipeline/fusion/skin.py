@@ -2,12 +2,12 @@
 
 Each vertex of the surface has a height over the closest point of the head. The estimated heights u minimise
 
-    sum_i w_i (d_i - u_i)^2 / (n_i s_i^2)  +  sum_i p_i k_i (u_i / l)^2  +  sum_(i, j) sqrt(k_i k_j) (u_i - u_j)^2,
+    sum_i w_i (d_i - u_i)^2 / (n_i s_i^2)  +  sum_i p_i k_i (u_i / l)^2  +  sum_(i, j) sqrt(k_i k_j) (u_i - u_j)^2.
 
-where d are the measured heights and s their standard deviation, which n neighbours have in common. p is the probability
-of skin, and the stiffness k is the inverse variance of the head's error. Thus noisy regions take the head's shape, and
-regions without depth continue the heights at their border smoothly. A head with a large error hardly changes the
-measured surface. Hair (p = 0) is not changed, and p gives a smooth transition to skin.
+In this sum d are the measured heights and s their standard deviation, which n neighbours have in common. p is the
+probability of skin, and the stiffness k is the inverse variance of the head's error. With these equations noisy regions
+take the head's shape, and regions without depth continue the heights at their border smoothly. A head with a large
+error hardly changes the measured surface. Hair (p = 0) is not changed, and p gives a smooth transition to skin.
 
 The robust weight w falls where a measured height differs from the estimate by several combined standard deviations
 (Geman and McClure's weights, from wide to narrow). The weight rejects single craters and specks, but keeps whole
@@ -124,15 +124,15 @@ def combine_with_head(
 
 def depth_deviation_mm(beside: Adjacency, stated_mm: PerVertex, seen: SeenVertices) -> PerVertex:
     """Returns the standard deviation s of the measured heights, at least ``MIN_DEVIATION_MM``: the larger of a vertex's
-    value and the mean around it. For unseen vertices it grows with the distance to seen vertices."""
+    value and the mean around it. For unseen vertices s grows with the distance to seen vertices."""
     around_mm = mean_around(beside, stated_mm, seen.themselves.astype(float))
     noise_mm = np.where(seen.themselves, np.maximum(stated_mm, around_mm), seen.guess_deviation_mm())
     return np.hypot(noise_mm, MIN_DEVIATION_MM)
 
 
 def head_stiffness(head_mm: PerVertex, unsure: PerVertex) -> PerVertex:
-    """Returns the stiffness k (1/mm2) of the head, 0 to ``STIFFNESS / MIN_DEVIATION_MM**2``. Where ``unsure`` exceeds 1
-    the stiffness falls with its square."""
+    """Returns the stiffness k (1/mm2) of the head, 0 to ``STIFFNESS / MIN_DEVIATION_MM**2``. Where ``unsure`` exceeds
+    1, the stiffness falls with the square of ``unsure``."""
     return STIFFNESS / (np.maximum(head_mm, MIN_DEVIATION_MM) * np.maximum(unsure, 1.0)) ** 2
 
 

@@ -4,7 +4,7 @@ Expressions and other displacements can make closed lips intersect, fold closing
 into the head. Each bad region, if necessary with rings of triangles around it, first gets the shape of the model's mean
 head, which has no bad triangles. The region's displacement from the mean head is interpolated from the region's border,
 so that an ear remains an ear. Regions that are still bad become smooth surfaces through their border (membranes). All
-other vertices stay unchanged."""
+vertices outside bad regions stay unchanged."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -108,7 +108,7 @@ def clean_mean_head(model: HeadModel) -> Vertices:
 
 
 def untangled(vertices: Vertices, topology: Topology, rest: Vertices | None = None) -> Vertices:
-    """Repairs all bad regions of a mesh. The result is tested in single precision, as files store it.
+    """Repairs all bad regions of a mesh. The repaired mesh is tested in single precision, as files store it.
 
     Args:
         vertices: mm.

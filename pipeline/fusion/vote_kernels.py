@@ -59,8 +59,8 @@ def vote(
     A view's vote is the distance to the tangent plane of the pixel at the node's projection. Votes are limited to
     ``reach`` in front of the plane, and left out if the node lies more than ``behind`` behind it. The value is the mean
     of the votes that agree with their weighted median; the weight falls with the square of their fraction. A node
-    without a vote has weight 0 (or ``UNDECIDED``). The value of such a node is the distance to the visual hull, or to
-    the back of a body of limited thickness behind a seen surface.
+    without any view's vote has weight 0 (or ``UNDECIDED``). The value of a node without votes is the distance to the
+    visual hull, or to the back of a body of limited thickness behind a seen surface.
 
     ``index`` (n, 3) and ``corner`` (3, world frame, mm) give the positions of nodes, ``step_mm`` apart. ``limits`` are
     reach, behind, largest difference of agreeing votes, the deviation (mm) of unit weight and the lower limit of
@@ -117,8 +117,8 @@ def vote(
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def seen_at(camera: np.ndarray, place: np.ndarray) -> tuple[float, float, float]:
-    """Projects a point (world frame, mm) into a camera, which is a row of ``view_stack.ViewStack.cameras``. Returns
-    depth (mm), column and row (px)."""
+    """Projects a point (world frame, mm) into a camera, which is a row of ``view_stack.ViewStack.cameras``. Returns the
+    point's depth (mm), column and row (px)."""
     x, y, depth = placed(camera, place[0], place[1], place[2])
     inverse = 1.0 / depth  # one division: they are what takes long here
     column, row = pinhole(inverse * x, inverse * y, camera[LENS:])
@@ -128,7 +128,7 @@ def seen_at(camera: np.ndarray, place: np.ndarray) -> tuple[float, float, float]
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def nearest_pixel(column: float, row: float, size: np.ndarray) -> tuple[int, float]:
     """Returns the flat index of the pixel nearest to an image point, and the distance (px) of the point outside the
-    image. ``size`` is height and width."""
+    image. ``size`` is the image's height and width."""
     inside_column, inside_row = min(max(column, 0.0), size[1] - 1.0), min(max(row, 0.0), size[0] - 1.0)
     beyond = 0.0
     if inside_column != column or inside_row != row:

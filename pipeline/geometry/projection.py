@@ -1,8 +1,8 @@
-"""Packs camera parameters into rows of numbers for compiled loops (``projection_kernels``). The results equal those of
-``rig.camera``. The module also draws meshes on the CPU: the visible triangle at each pixel and its depth.
+"""Packs camera parameters into rows of numbers for compiled loops (``projection_kernels``). The projected pixels equal
+those of ``rig.camera``. The module also draws meshes on the CPU: the visible triangle at each pixel and its depth.
 
-Texturing (the paper's section 4.5) uses this z-buffer for visibility. Report figures and small pictures use this
-z-buffer because reading images back from OpenGL takes longer. Tests compare this z-buffer with the OpenGL renderer
+Texturing (the paper's section 4.5) uses the z-buffer for visibility. Report figures and small pictures use the module's
+z-buffer because reading images back from OpenGL takes longer. Tests compare the z-buffer with the OpenGL renderer
 ``rig.render``. Vertices are projected exactly, with lens distortion. Triangle edges are straight in the image; on a
 head of 48,000 vertices (edges of 2 to 5 px) the resulting error is below 0.001 px."""
 

@@ -1,11 +1,11 @@
 """Holds the compiled camera model: projection from world to pixel, its derivatives, and the z-buffer. Module
 ``projection`` packs the rows that describe cameras.
 
-A camera is a row of numbers. A row named ``pose`` begins with the rotation (9 numbers, row by row) and translation (3,
-mm) of camera_from_world. The lens, if present, begins at entry 12: fx fy cx cy (px) and, if the lens distorts, k1 k2 p1
-p2 k3 and the largest ray radius at which the distortion is valid. The helper functions are inlined, so they use the
-floating-point mode (fast or strict) of the calling loop. Only ``distorted`` always uses fast mode; strict mode made the
-visual hull 10 % slower."""
+The loops take each camera as a row of numbers. A row named ``pose`` begins with the rotation (9 numbers, row by row)
+and translation (3, mm) of camera_from_world. The lens, if present, begins at entry 12: fx fy cx cy (px) and, if the
+lens distorts, k1 k2 p1 p2 k3 and the largest ray radius at which the distortion is valid. The helper functions are
+inlined, so they use the floating-point mode (fast or strict) of the calling loop. Only ``distorted`` always uses fast
+mode; strict mode made the visual hull 10 % slower."""
 
 import numpy as np
 

@@ -1,7 +1,7 @@
 """Finds closest points on triangle surfaces, exactly among the triangles near the closest surface samples; also lists
 the faces around each vertex.
 
-Lengths are in mm, in any common frame."""
+All lengths are in mm, and points and surface in one common frame."""
 
 from dataclasses import dataclass
 

@@ -57,8 +57,8 @@ def linked(index: np.ndarray, keys: np.ndarray, ny: int, nz: int) -> np.ndarray:
 @njit(cache=True, nogil=True)
 def net_vertices(field: np.ndarray, index: np.ndarray, neighbours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the vertices (float64, in grid steps) of the surface net: in each cell that the surface crosses, the mean
-    of its crossings with the cell's edges. Also returns the vertex index (int32) of each node's cell, -1 for a cell
-    without a vertex."""
+    of its crossings with the cell's edges. The function also returns the vertex index (int32) of each node's cell, -1
+    for a cell without a vertex."""
     corners = np.empty(8, np.int64)
     of_cell = np.full(len(field), -1, np.int32)
     vertices = np.empty((len(field), 3))

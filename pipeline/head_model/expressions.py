@@ -82,7 +82,7 @@ def words(name: str) -> str:
 
 def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
     """Returns, for each of Apple's 52 names, the indices of the model's blendshapes that together correspond to it;
-    empty if there is none. For most names this is exactly one blendshape, which has the same name. A model may instead
+    empty if there is none. Most of Apple's names have exactly one blendshape, of the same name. A model may instead
     have two blendshapes for one name, left and right (ICT-FaceKit's cheekPuff_L and cheekPuff_R)."""
     known = {plain_name(name): k for k, name in enumerate(names)}
     found = {}
@@ -93,8 +93,8 @@ def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
 
 
 def weights_from_text(texts: Sequence[str], names: tuple[str, ...]) -> dict[str, float]:
-    """Parses texts such as ``mouthSmile_L=0.5``, and returns the weights by the model's expression names. Texts may
-    also use Apple's names. Raises InputError that lists every fault."""
+    """Parses texts such as ``mouthSmile_L=0.5``, and returns the weights by the model's expression names. The texts may
+    also use Apple's names of expressions. Raises InputError that lists every fault of the texts."""
     known = {plain_name(name): name for name in names} | {name: name for name in names}
     found, faults = {}, []
     for text in texts:

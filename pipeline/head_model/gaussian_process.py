@@ -7,9 +7,9 @@ https://doi.org/10.1109/TPAMI.2017.2739743): displacement along the mean's norma
     k(x, y) = sum_i a_i^2 [ (1 - f) (g_i(x, y) + g_i(x, My)) + f g_i(x, y) ],
     g_i(x, y) = exp(-|x - y|^2 / (2 l_i^2)),
 
-Here M mirrors at the median plane, because faces deviate from their population mostly symmetrically. The leading
-eigenfunctions of this process are computed by Nystroem's method on a subset of the vertices, scaled by their standard
-deviations and appended to the eigenheads as modes with unit prior, orthogonal to the span of the eigenheads.
+The operator M mirrors at the median plane, because faces deviate from their population mostly symmetrically. The
+leading eigenfunctions of this process are computed by Nystroem's method on a subset of the vertices, scaled by their
+standard deviations and appended to the eigenheads as modes with unit prior, orthogonal to the span of the eigenheads.
 Displacements are along the normal only, because sliding along the surface changes no silhouette."""
 
 from collections.abc import Callable

@@ -95,7 +95,7 @@ def rounded(values: np.ndarray) -> Float32[np.ndarray, "..."]:
 
 
 def read_parts(path: Path) -> tuple[ModelParts, str]:
-    """Returns the content of a model file and its SHA-256. Raises BadModel if the file cannot be used."""
+    """Returns the content of a model file and its SHA-256. Raises BadModel if the model file cannot be used."""
     try:
         raw = path.read_bytes()
     except OSError as fault:

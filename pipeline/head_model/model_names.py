@@ -1,4 +1,4 @@
-"""Lists the available head models and their files. This module loads no model, so the command line can call it quickly.
+"""Lists the available head models and their files. The module loads no model, so the command line can call it quickly.
 
 The data folder is given by the option ``--data``, otherwise by the variable EIGENHEAD_DATA; it is otherwise
 ``$XDG_DATA_HOME/eigenhead`` or ~/.local/share/eigenhead. Models are stored in the data folder's subfolder ``models``,
@@ -45,7 +45,7 @@ def list_models() -> dict[str, Path]:
 
 
 def model_path(name_or_path: str | Path) -> Path:
-    """Returns the file of a head model that is given by its name or path. Raises UnknownModel if none exists."""
+    """Returns the file of a head model that is given by its name or path. Raises UnknownModel if no file exists."""
     name = str(name_or_path)
     if name in PACK_FILES:
         return PACKS / PACK_FILES[name]

@@ -80,8 +80,8 @@ def boundary_loops(faces: Int[np.ndarray, "F 3"]) -> list[list[int]]:
 
 def close_loop(vertices: Float[np.ndarray, "V 3"], loop: list[int]) -> Int[np.ndarray, "T 3"]:
     """Returns triangles that close a long opening such as a mouth or an eye: a strip from the border vertex with the
-    smallest x to the one with the largest x. The strip needs no new vertices. The triangles have the orientation of the
-    surface around the opening if ``loop`` is a result of ``boundary_loops``."""
+    smallest x to the one with the largest x. The strip of triangles needs no new vertices. The triangles have the
+    orientation of the surface around the opening if ``loop`` is a result of ``boundary_loops``."""
     x = vertices[loop, 0]
     start, end = int(x.argmin()), int(x.argmax())
     ring = loop[start:] + loop[:start]

@@ -3,7 +3,7 @@
 A matt point reflects the same light in all directions, so ``g_k c_k + b_k`` should be equal for all cameras k that see
 it. Each colour channel is solved by least squares in linear light; the unknown true colour of each point is eliminated.
 Cauchy weights reduce the influence of shiny skin and of errors in the fitted surface. Two priors remove the remaining
-ambiguity: the product of all gains is 1, and offsets are small."""
+ambiguity of the gains: the product of all gains is 1, and offsets are small."""
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -20,7 +20,7 @@ def balance(
     weights: Float32[np.ndarray, "k v"], colours: Float32[np.ndarray, "k v 3"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
     """Computes a gain and an offset for each camera and channel, so that ``gains * colours + offsets`` agree between
-    cameras. The product of the gains in each channel is 1."""
+    cameras. The product of all cameras' gains in each channel is 1."""
     cameras = len(weights)
     shared = np.flatnonzero(np.count_nonzero(weights, axis=0) >= 2)
     shared = shared[:: max(1, len(shared) // SAMPLE)]

@@ -12,8 +12,8 @@ QUIET_LEVELS = 1.2  # noise below which matching needs no more blur
 
 def noise_level(grey: Float32[np.ndarray, "h w"]) -> float:
     """Estimates the standard deviation of an image's white noise (Immerkaer 1996,
-    https://doi.org/10.1006/cviu.1996.0060), with a median because edges hardly affect it. The result is at least 0.3
-    grey levels, the error of rounding to 8 bits."""
+    https://doi.org/10.1006/cviu.1996.0060), with a median because edges hardly affect it. The returned noise is at
+    least 0.3 grey levels, the error of rounding to 8 bits."""
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     response = cv2.filter2D(grey[::2], -1, kernel)[2:-2, 2:-2]
     return max(float(np.median(np.abs(response))) * 1.4826 / 6.0, 0.3)

@@ -51,13 +51,13 @@ def silhouette_from_mask(mask: Mask) -> Silhouette:
 
 
 def signed_distance(mask: Mask) -> Float32[np.ndarray, "h w"]:
-    """Returns the sub-pixel signed distance (px) to the contour of a binary mask, negative inside. Without a contour
-    the distance is +-(h + w), farther than any pixel.
+    """Returns the sub-pixel signed distance (px) to the contour of a binary mask, negative inside. If the mask has no
+    contour, the distance is +-(h + w), farther than any pixel.
 
-    Far from the contour it is the Euclidean distance to the nearest pixel *centre* on the other side of the contour,
-    minus half a pixel. Within two pixels of the contour, this distance would be wrong by 0.3 px, because the mask has
-    steps. There the distance d is computed from the mask after a Gaussian blur, which turns a straight edge into
-    ``Phi(-d / s)``."""
+    Far from the contour the result is the Euclidean distance to the nearest pixel *centre* on the other side of the
+    contour, minus half a pixel. Within two pixels of the contour, the Euclidean distance is wrong by 0.3 px, because
+    the mask has steps. Near the contour, the distance d is computed from the mask after a Gaussian blur, which turns a
+    straight edge into ``Phi(-d / s)``."""
     inside, outside = _distance_transforms(mask)
     far = float(sum(mask.shape))
     distance = np.clip(np.where(mask, 0.5 - inside, outside - 0.5), -far, far)

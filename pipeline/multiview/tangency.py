@@ -85,8 +85,8 @@ class _Outline:
 def outer_hull(silhouette: Silhouette, inset_px: float = 0.0) -> Float[np.ndarray, "n 2"]:
     """Returns the corners (px) of the convex hull of a mask with sub-pixel accuracy; empty for an empty mask.
 
-    With ``inset_px``, the hull is that of a curve inside the contour at this distance. This curve excludes strands and
-    specks thinner than twice ``inset_px``."""
+    With ``inset_px``, the hull is that of a curve inside the contour at this distance. The inset curve excludes strands
+    and specks thinner than twice ``inset_px``."""
     inside = silhouette.distance < -inset_px if inset_px else silhouette.mask
     contours, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:

@@ -42,8 +42,8 @@ class TriangulatedPoint:
     residuals_px: Mapping[str, Float[np.ndarray, " 2"]]
 
     def misfit(self, noise_px: float) -> float:
-        """Returns the sum of squared residuals divided by the squared noise. For correct pixels it is distributed as
-        chi-square with ``2 * views - 3`` degrees of freedom."""
+        """Returns the sum of squared residuals divided by the squared noise. For correct pixels the sum is distributed
+        as chi-square with ``2 * views - 3`` degrees of freedom."""
         return sum(float(r @ r) for r in self.residuals_px.values()) / noise_px**2
 
 
@@ -160,9 +160,9 @@ def parallax(
     value: Float[np.ndarray, "n v"],
 ) -> Float[np.ndarray, " n"]:
     """Returns the parallax of points on a surface: the displacement of two views' images against each other, measured
-    along the surface, for each millimetre that the surface moves along its normal. The result is the weighted root mean
-    square over all pairs of views. Noise, highlights and calibration errors displace an image; this displacement
-    divided by the parallax is the error in depth.
+    along the surface, for each millimetre that the surface moves along its normal. The returned parallax is the
+    weighted root mean square over all pairs of views. Noise, highlights and calibration errors displace an image; this
+    displacement divided by the parallax is the error in depth.
 
     ``points``: points on a surface, mm. ``normals``: unit normals of the surface there. ``centres``: camera centres, in
     the same frame. ``view``: the cameras that compare each point; -1 for none. ``value``: their weights; 0 for none.

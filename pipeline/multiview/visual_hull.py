@@ -24,8 +24,8 @@ def mask_extent(masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig) -> tuple
     have a lower resolution than the images.
 
     The cube's centre is the point nearest to the rays through the masks' centres; its edge is the largest diagonal of a
-    mask at that depth. Without any mask, the centre is the point at which the cameras are directed, and the edge is 400
-    mm."""
+    mask at that depth. Without any mask, the cube's centre is the point at which the cameras are directed, and the edge
+    is 400 mm."""
     views, rays = [], []
     for name, mask in masks.items():
         camera = rig[name]

@@ -53,8 +53,8 @@ class HeadGuide:
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
     """Holds a coarse grid of cells over one view. Where the head covers a cell, the cell's position (``into_face_mm``,
-    ``above_chin_mm``) is that of the fitted head's surface. Elsewhere it is the position on the plane through the
-    head's centre that faces the camera."""
+    ``above_chin_mm``) is that of the fitted head's surface. Elsewhere the cell's position is that on the plane through
+    the head's centre that faces the camera."""
 
     camera: Camera
     size_px: int

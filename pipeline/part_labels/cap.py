@@ -2,7 +2,7 @@
 
 Colours are compared by chromaticity, which shading does not change. A coloured cap is compared by hue alone, because
 sheen changes only saturation, and because the user may give the colour by a name. Grey caps are compared by luminance,
-with a wide tolerance. Then the cap's colour is measured in this capture: the median of the pixels above the brows that
+with a wide tolerance. The cap's colour is then measured in this capture: the median of the pixels above the brows that
 resemble the given colour. Cells whose colour is nearer to that of the cheeks are labelled skin. In each view, the cap
 is the largest connected set of cells, with highlights and seams filled, if most of it lies above the brows."""
 

@@ -11,8 +11,8 @@ from jaxtyping import Int, UInt8
 
 
 class Part(IntEnum):
-    """Names the label (skin, hair or clothes) of a vertex or surface point. The numbers are stored in files and must
-    not change."""
+    """Names the label (skin, hair or clothes) of a vertex or surface point. The codes' numbers are stored in files and
+    must not change."""
 
     UNSEEN = 0
     SKIN = 1

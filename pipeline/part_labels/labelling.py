@@ -1,10 +1,10 @@
 """Labels every pixel of the subject as skin, hair or clothes, with models learnt from the same capture.
 
 The labelling starts from positions: the middle of the fitted face is skin. Pixels beside the head and above the chin
-are hair, unless they resemble that skin (a bald crown). Pixels below the chin are clothes, unless they resemble that
-skin. Expectation maximisation (Dempster, Laird and Rubin 1977) then learns the appearance of each label in this
-capture: histograms of colour and fine structure over all views, with the cameras' colours balanced. The prior
-probability depends on the position on the head. A filter that preserves edges of the photograph smooths the
+are hair, unless they resemble the face's skin (a bald crown). Pixels below the chin are clothes, unless they resemble
+the face's skin. Expectation maximisation (Dempster, Laird and Rubin 1977) then learns the appearance of each label in
+this capture: histograms of colour and fine structure over all views, with the cameras' colours balanced. A label's
+prior probability depends on the position on the head. A filter that preserves edges of the photograph smooths the
 probabilities (He, Sun and Tang 2010, guided image filtering, https://doi.org/10.1007/978-3-642-15549-9_1). A cap is
 labelled as clothes if it resembles the clothes, and as hair otherwise; both hide skin."""
 
@@ -230,8 +230,8 @@ def fit_appearance(
     cell under skin, hair, clothes and an outlier class, plus the logarithm of the probability that the subject shows
     this label at all.
 
-    It starts from the cells whose position decides their label; cells of hair and clothes have less weight the more
-    they resemble skin."""
+    The fit of colours starts from the cells whose position decides their label; cells of hair and clothes have less
+    weight the more they resemble skin."""
     colour, detail = appearance.T
     share = start.copy()
     share[:, HAIR_CHANNEL] = np.maximum(share[:, HAIR_CHANNEL], lower) * unlikeness

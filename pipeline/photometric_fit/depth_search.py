@@ -3,23 +3,23 @@
 
 The variance of this position is that of a shift between two signals with correlation rho:
 
-    variance = floor^2 + noise area / window area * (1 - rho) / |d^2 rho / d shift^2|,
+    variance = floor^2 + noise area / window area * (1 - rho) / |d^2 rho / d shift^2|.
 
-It therefore depends on texture, noise, defocus and oblique views. Gain and offset of a camera have no effect on the
-correlation.
+The variance therefore depends on texture, noise, defocus and oblique views. Gain and offset of a camera have no effect
+on the correlation.
 
 The same patches also determine by how much the image of each view should shift. Where a patch's views correlate best,
-the negative mean correlation equals, up to constants, the least-squares cost ``sum_k v_k |f_k - T|^2``. Here f_k are
-the patch's grey values in view k, centred and of unit norm, v_k is the view's weight, and T is the weighted mean of all
-f_k. Taking T as the mean eliminates the unknown texture exactly, and also any sliding along the surface. Linearised in
-the image shifts delta_k (px) of the views, this cost has the second derivatives H and the gradient
+the negative mean correlation equals, up to constants, the least-squares cost ``sum_k v_k |f_k - T|^2``. In this cost
+f_k are the patch's grey values in view k, centred and of unit norm, v_k is the view's weight, and T is the weighted
+mean of all f_k. Taking T as the mean eliminates the unknown texture exactly, and also any sliding along the surface.
+Linearised in the image shifts delta_k (px) of the views, this cost has the second derivatives H and the gradient
 
-    H_kl = v_k [k = l] <g_k, g_k> - v_k v_l / V <g_k, g_l>,   gradient_k = v_k <g_k, f_k - T>,
+    H_kl = v_k [k = l] <g_k, g_k> - v_k v_l / V <g_k, g_l>,   gradient_k = v_k <g_k, f_k - T>.
 
-Here g_k are the image derivatives and V is the sum of the weights. A displacement u along the normal and camera
-corrections c_k cause the image shifts ``delta_k = p_k u + C_k c_k``. Eliminating u leaves two results: the derivative
-of the patch's depth by the cameras' poses, and a quadratic form in the camera corrections alone, for image shifts that
-no surface explains. Thousands of patches together reveal a camera error of 0.2 px."""
+In these formulas g_k are the image derivatives and V is the sum of the weights. A displacement u along the normal and
+camera corrections c_k cause the image shifts ``delta_k = p_k u + C_k c_k``. Eliminating u leaves two results: the
+derivative of the patch's depth by the cameras' poses, and a quadratic form in the camera corrections alone, for image
+shifts that no surface explains. Thousands of patches together reveal a camera error of 0.2 px."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -305,8 +305,8 @@ def metric_rig(cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"]) -
     """Returns an information matrix (inverse covariance of all cameras' corrections) that keeps the rig's size: a
     common relative change of all camera distances to the head has the standard deviation ``RIG_SCALE_SPREAD``.
 
-    The rig's size comes from one calibration board of known size. Images alone cannot determine it: outlines that are a
-    tenth of a pixel too wide would move every camera and the surface closer."""
+    The rig's size comes from one calibration board of known size. Images alone cannot determine the rig's size:
+    outlines that are a tenth of a pixel too wide would move every camera and the surface closer."""
     depth = np.array([camera.camera_from_world.apply(at_world)[2] for camera in cameras])
     nearer = np.zeros((len(depth), 6))
     nearer[:, 5] = 1.0 / (len(depth) * depth)

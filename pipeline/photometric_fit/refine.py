@@ -126,8 +126,8 @@ def rounds_of_rig(factor: float) -> tuple[Round, ...]:
 
 @lru_cache(maxsize=1)  # 150 MB; studios work with one model
 def finer(model: HeadModel) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m c 3"]]:
-    """Returns the model with additional fine modes, its patches, and its modes at the patches' centres. The result
-    depends on the model alone and is cached."""
+    """Returns the model with additional fine modes, its patches, and its modes at the patches' centres. All three
+    values depend on ``model`` alone and are cached."""
     length, amplitude = FINE_LENGTH_MM, FINE_AMPLITUDE_MM
     sizes = {
         "sample_mm": SAMPLE_MM,

@@ -86,7 +86,7 @@ class GazeReport(TypedDict):
 
 
 class EyeReport(TypedDict):
-    """Describes an eye. ``seen`` is false if its iris was not found. ``cause`` then gives the reason (``closed``,
+    """Describes an eye. ``seen`` is false if its iris was not found; ``cause`` then gives the reason (``closed``,
     ``few-views``, ``coarse``: too few pixels, ``unclear``: no clear border of the iris), and all other fields are null.
 
     ``iris`` is the centre of the iris' border (world frame, mm), ``radius`` its radius (mm). ``gaze`` is the unit

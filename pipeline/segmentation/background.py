@@ -1,10 +1,10 @@
 """Estimates the background behind the subject from the clean plate, a picture of the empty studio.
 
-Between plate and shot the lamps drift, and a camera may change its exposure. So the plate is multiplied by a smooth
-gain field for each channel, estimated from the pixels that still show the background. The estimate starts at the mode
-of the log ratio of image to plate. The background determines the mode, even for a large subject, because the subject's
-ratios have no common value. The noise is estimated from the residuals as a function of brightness. The noise is larger
-at pixels where several plates differ more.
+Between plate and shot the lamps drift, and a camera may change its exposure. Therefore the plate is multiplied by a
+smooth gain field for each channel, estimated from the pixels that still show the background. The estimate starts at the
+mode of the log ratio of image to plate. The background determines the mode, even for a large subject, because the
+subject's ratios have no common value. The noise is estimated from the residuals as a function of brightness. The noise
+is larger at pixels where several plates differ more.
 """
 
 from dataclasses import dataclass

@@ -4,7 +4,7 @@ The module computes each pixel's log odds of foreground against the corrected ba
 (``pipeline.segmentation.background``), and smooths them by mean-field sweeps. Neighbours are coupled weakly where their
 *differences* to the plate differ (Sun et al., *Background Cut*, ECCV 2006), so edges of the backdrop have no effect. A
 pixel similar to the plate is certainly background only if the subject has another colour (``Decision.clear``). Other
-pixels are doubtful, as are pixels where a shadow might be a coat. For doubtful pixels,
+pixels similar to the plate are doubtful, as are pixels where a shadow might be a coat. For doubtful pixels,
 ``pipeline.segmentation.segment`` uses the other cameras, and ``reconsider`` decides again.
 
 Soft shadows on the backdrop, and light that the subject reflects onto the backdrop, count as background.
@@ -117,14 +117,14 @@ def decide(image: UInt8[np.ndarray, "_ _ 3"], plates: tuple[UInt8[np.ndarray, "_
 
 def doubtful(decision: Decision) -> Mask:
     """Returns a mask of pixels outside the subject's mask that might show the subject: pixels near it where subject and
-    plate look alike. The other cameras decide about these pixels."""
+    plate look alike. The other cameras decide about such pixels."""
     near = dilated(decision.mask, REACH) & ~decision.mask
     return near & ~decision.clear & (decision.own_odds > -ALLOWED)
 
 
 def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"]) -> Decision:
-    """Revises the decision by means of the other cameras. ``dissent`` is, for each doubtful pixel, the number of
-    cameras that exclude the subject; it is negative at all other pixels."""
+    """Revises the decision about doubtful pixels by means of the other cameras. ``dissent`` is, for each doubtful
+    pixel, the number of cameras that exclude the subject; it is negative at all other pixels."""
     prior = np.where(dissent == 0, ALLOWED, np.where(dissent >= 3, -DENIED, 0.0))
     revised = np.clip(np.maximum(decision.odds, decision.own_odds) + prior, -MAX_ODDS, MAX_ODDS)
     odds = np.where(dissent >= 0, revised, decision.odds).astype(np.float32)
@@ -151,9 +151,9 @@ def _subject_colour_odds(image: Picture, mask: Mask, paint: Picture, chi2: Plane
 
 
 def find_mixtures(image: UInt8[np.ndarray, "_ _ 3"], coarse: Picture, background: Background) -> tuple[Plane, Plane]:
-    """Returns the squared difference of each coarse pixel from the plate (mean over the channels). Also returns how
-    much the pixel mixes subject and plate, as strands of hair do: the variance of its four quarters relative to this
-    difference. The measure does not depend on the picture's size."""
+    """Returns the squared difference of each coarse pixel from the plate (mean over the channels). The function also
+    returns how much the pixel mixes subject and plate, as strands of hair do: the variance of its four quarters
+    relative to this difference. The measure does not depend on the picture's size."""
     size = coarse.shape[1::-1]
     averaged = 2 * size[0] < image.shape[1]
     quarters = _quarters(image, (2 * size[0], 2 * size[1]))
@@ -195,7 +195,7 @@ def colours_apart(colour: Picture, other: Picture, variance: Picture) -> Plane:
 
 def _other_colour(difference: Picture, paint: Picture, plate: Picture, variance: Picture) -> tuple[Mask, Plane]:
     """Finds faint differences to the plate that neither a shadow nor a mixture with the subject's colour nearby
-    (``paint``) explains. Also returns the remaining chi-squared, averaged over nine pixels."""
+    (``paint``) explains. The function also returns the remaining chi-squared, averaged over nine pixels."""
     weight = 3 / variance  # of a mean over nine pixels, whose errors are not all their own
     faint = ((difference**2 * weight) @ CHANNEL_SUM < MAX_FAINT_CHI2).astype(np.float32)
     mean = cv2.blur(difference * faint[:, :, None], (3, 3)) / np.maximum(cv2.blur(faint, (3, 3)), 0.1)[:, :, None]

@@ -6,10 +6,10 @@ which darkens where its surface turns away from the camera. Least squares over t
 gives alpha. The contour is where alpha is one half, which is the position of the edge under any symmetric blur.
 
 Colours are mixed in linear light; with sRGB codes the contour of dark hair was 0.25 px too far inside. Without q, the
-contour of cheeks, which darken towards their edge, was 0.2 px too far inside. B is first matched to the pixels just
-outside the mask, so that a shadow or reflected light at the edge does not shift the contour. F may vary (a dark edge, a
-lock of hair), so it is estimated again inside the first contour. If the colours are too similar, alpha follows the
-coarse mask.
+contour of cheeks, which darken towards their edge, was 0.2 px too far inside. The background B is first matched to the
+pixels just outside the mask, so that a shadow or reflected light at the edge does not shift the contour. The colour F
+may vary (a dark edge, a lock of hair), so it is estimated again inside the first contour. If the colours are too
+similar, alpha follows the coarse mask.
 """
 
 from dataclasses import dataclass

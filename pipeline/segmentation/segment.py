@@ -1,9 +1,9 @@
 """Computes one silhouette for each camera of a capture by background subtraction (the paper's section 5.4).
 
 First ``pipeline.segmentation.foreground`` decides which pixels show the subject; other cameras decide about doubtful
-pixels. Then ``pipeline.segmentation.matting`` finds the sub-pixel contour. Last the silhouettes of all cameras are
-compared. ``quality.usable`` is False if a mask would harm a fit, and ``quality.warnings`` give the reason. Masks that
-the operator supplies replace the computed masks.
+pixels. After this decision ``pipeline.segmentation.matting`` finds the sub-pixel contour. As the last step the
+silhouettes of all cameras are compared. ``quality.usable`` is False if a mask would harm a fit, and
+``quality.warnings`` give the reason. Masks that the operator supplies replace the computed masks.
 
 A coarse visual hull (the paper's figure 1) shows whether the silhouettes agree. A voxel is empty according to a camera
 that sees it clearly outside its silhouette. A view can be wrong in two ways. *Strange* area is mask where, according to
@@ -233,7 +233,7 @@ def _without_specks(
     of remaining holes.
 
     A small hole is noise. A larger hole is noise if the ``coarse`` probability, in which the sensor's noise is
-    averaged, is high in all of it. Such holes occur if skin has the colour of the backdrop.
+    averaged, is high in all of it. Holes from noise occur if skin has the colour of the backdrop.
     """
     mask = alpha > 0.5
     labels, areas = _labelled(mask, 4)

@@ -1,17 +1,17 @@
 """Computes the paper's objective (eqs. 2 and 5): the boundary-weighted XOR of input and model silhouettes, over all
 cameras.
 
-The input is shape coefficients. The output is one number; the renderer draws and sums the pixels, so no image is read
-back.
+The objective's input is shape coefficients. The output is one number; the renderer draws and sums the pixels, so no
+image is read back.
 
-Some pixels get no weight. In eq. (5) a mismatch far from the input contour has hardly any weight. This suffices for
-parts *inside* the outline that the model lacks, but not for parts of the input outside it that no model can reproduce.
-Below the model's cut through the neck, the input silhouette continues into shoulders; every pixel by which the mesh's
-open edge moves down would reduce the cost, and the head would grow a neck. Hair would likewise reward an enlarged
-skull. A pixel therefore counts only if the nearest part of the aligned head's outline belongs to the face region (ear
-to ear, forehead to chin); all other pixels have weight zero. The pixels are chosen once for each mesh, from the head at
-the start of its search, so that the cost during the search is a fixed function of the coefficients: eq. (5) with some
-weights zero. ``speaking="all"`` gives exactly the paper's cost.
+Some pixels get no weight. In eq. (5) a mismatch far from the input contour has hardly any weight. Such a low weight
+suffices for parts *inside* the outline that the model lacks, but not for parts of the input outside it that no model
+can reproduce. Below the model's cut through the neck, the input silhouette continues into shoulders; every pixel by
+which the mesh's open edge moves down would reduce the cost, and the head would grow a neck. Hair would reward an
+enlarged skull in the same way. A pixel therefore counts only if the nearest part of the aligned head's outline belongs
+to the face region (ear to ear, forehead to chin); all other pixels have weight zero. The pixels are chosen once for
+each mesh, from the head at the start of its search, so that the cost during the search is a fixed function of the
+coefficients: eq. (5) with some weights zero. ``speaking="all"`` gives exactly the paper's cost.
 
 The cut through the neck has no weight, so triangles close it and back faces need not be drawn, which saves 5 of 19 ms
 in each evaluation. If the neck's cut is not flat, the closing triangles add a thousandth of the silhouette's area."""
@@ -117,9 +117,9 @@ def mask_at_scale(distance: Float[np.ndarray, "h w"], scale: float) -> Bool[np.n
     """Returns the mask at another resolution: True where a pixel's centre lies inside the contour, as in the renderer.
 
     The mask is computed from the signed distance (px, negative inside), averaged over each larger pixel. The contour of
-    a binary mask often passes exactly through a larger pixel's centre. If all such pixels had the same value, the
-    contour would move by 0.15 px everywhere (0.3 px if the mask's pixels were counted), so their values alternate like
-    a chessboard."""
+    a binary mask often passes exactly through a larger pixel's centre. If all pixels with such a centre had the same
+    value, the contour would move by 0.15 px everywhere (0.3 px if the mask's pixels were counted), so their values
+    alternate like a chessboard."""
     height, width = distance.shape
     smaller = cv2.resize(distance, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
     rows, columns = np.ogrid[: smaller.shape[0], : smaller.shape[1]]

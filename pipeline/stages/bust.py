@@ -38,9 +38,9 @@ FACE_REACH_MM = 10.0  # from the head's face: what lies farther in front of it i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapedBust:
-    """Holds the surface of the bust. ``face_silent_share`` (0 to 1) is the fraction of its face vertices that no depth
-    map supports. ``guessed_share`` is the fraction that the refined head did not measure either. ``likely_part`` is the
-    part label of each vertex; unseen vertices have the most likely label."""
+    """Holds the surface of the bust. ``face_silent_share`` (0 to 1) is the fraction of the bust's face vertices that no
+    depth map supports. ``guessed_share`` is the fraction that neither a depth map nor the refined head measured.
+    ``likely_part`` is the part label of each vertex; unseen vertices have the most likely label."""
 
     surface: BustSurface
     likely_part: UInt8[np.ndarray, " v"]
@@ -193,7 +193,7 @@ def push_out_hair(
     context: ReconstructionContext, views: Views, refined: RefinedHead, bust: Bust | None, coloured: Capture
 ) -> Staged[HairyHead | None]:
     """Moves the final head's vertices outwards to the bust's hair, and colours them from the photographs of
-    ``coloured``. Returns None without a bust, or if the settings do not request this. Warns ``hair-beyond-head`` if the
+    ``coloured``. Returns None without a bust, or if the settings do not request hair. Warns ``hair-beyond-head`` if the
     head's vertices do not reach the hair."""
     settings, rig = context.settings, context.rig
     if bust is None or settings.outputs.surface != "hair":

@@ -108,8 +108,8 @@ def judge_head(
 def fit_with_read_face(
     context: ReconstructionContext, head: HeadFit, displaced: DeformedSurface
 ) -> tuple[Fit, float, frozenset[int]]:
-    """Returns the fit with the expression from the deformed head. Also returns how many standard deviations a weight
-    must have to be reported, and the indices of doubtful expressions, which are left out.
+    """Returns the fit with the expression from the deformed head. The function also returns how many standard
+    deviations a weight must have to be reported, and the indices of doubtful expressions, which are left out.
 
     The expression is estimated again only if the fit has an expression. The lids always follow the measured points
     around the eye, if these determine the lids (``told_lids``).

@@ -106,7 +106,7 @@ def refine_with_likely_face(
     outlines: ContourSolution, images: Mapping[str, ImageRgb], hair: HairProbability
 ) -> tuple[ContourSolution, Detail, frozenset[int]]:
     """Refines the fit with the photographs. If the expression contradicts itself, the fit is repeated without doubtful
-    expressions, and kept if it explains the photographs equally well. Also returns the doubtful expressions."""
+    expressions, and kept if it explains the photographs equally well. Returns the doubtful expressions too."""
     solved, detail = refine_with_photographs(outlines, images, hair=hair)
     doubtful = doubtful_weights(solved.problem.model, solved.state.coefficients)
     if not doubtful:

@@ -106,8 +106,8 @@ def _read_pores(
     face: Bool[np.ndarray, " v"],
     chart: ChartColours | None,
 ) -> tuple[CloseViews | None, list[ReportWarning]]:
-    """Reads the full-size pictures for the detail ``pores``. Returns None for other details, or with a warning if files
-    are missing."""
+    """Reads the full-size pictures for the detail ``pores``. Returns None for other levels of detail, or with a warning
+    if files are missing."""
     if context.settings.detail != "pores":
         return None, []
     if context.read_original is None or coloured.decision is None:

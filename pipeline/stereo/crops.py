@@ -1,8 +1,8 @@
 """Prepares the photographs for dense matching: grey pinhole crops around the subject, at several sizes.
 
-A crop keeps its camera's pose and name, but has no lens distortion. A plane then maps from one view to another by a
-homography, which is nearly affine over a small window. So each photograph is undistorted once instead of in each
-comparison.
+A crop keeps its camera's pose and name, but has no lens distortion. Between crops a plane maps from one view to another
+by a homography, which is nearly affine over a small window. With such crops each photograph is undistorted once instead
+of in each comparison.
 """
 
 from collections.abc import Mapping

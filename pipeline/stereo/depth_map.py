@@ -2,8 +2,8 @@
 
 Window matching has a bias. The whole surface lies a little too deep, and curved parts come out too flat: protruding
 parts (bridge of the nose, lips) are cut off, and hollows are filled. To first order the flattening is ``share`` times
-the height of the surface's mean in a 2.5 mm window above the surface. ``pipeline.detail.depth_bias`` measures these two
-errors on each capture.
+the height of the surface's mean in a 2.5 mm window above the surface. ``pipeline.detail.depth_bias`` measures depth
+error and flattening on each capture.
 """
 
 from dataclasses import dataclass

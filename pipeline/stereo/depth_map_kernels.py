@@ -136,7 +136,7 @@ def _distance_at(distance_px, way, x, y):
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_depth_range(start, ways, distance_px, slack_px, low, high, step, near, far):
     """Fills ``near`` and ``far`` (h, w; mm of depth, 0 for none) with the first and the last depth at which each
-    pixel's ray is inside the visual hull. Depths between them may be outside.
+    pixel's ray is inside the visual hull. Depths between the first and the last may be outside the hull.
 
     Depths from ``low`` to ``high`` are tested in steps of ``step`` (mm). A point is inside if at least one other view
     sees it, and no other view sees it more than ``slack_px`` outside its silhouette. ``distance_px`` holds the signed

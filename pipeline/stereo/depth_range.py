@@ -98,8 +98,8 @@ def _bound_by_head(near: Plane, far: Plane, room: Bool[np.ndarray, "h w"], head:
     """Narrows the bounds, in place, to depths near the fitted head. ``head`` is the head's depth map (mm, infinite
     beside the head).
 
-    If all cameras stand on one side, the visual hull begins decimetres in front of the face. Then the bounds follow
-    from the head's depth at the pixel or, beside the head, from its least and greatest depth.
+    If all cameras stand on one side, the visual hull begins decimetres in front of the face. In this case the bounds
+    follow from the head's depth at the pixel or, beside the head, from its least and greatest depth.
     """
     seen = room & np.isfinite(head)
     if not seen.any() or np.median((head - near)[seen]) < LOOSE_HULL_MM:

@@ -9,12 +9,12 @@ collections*, 2007, https://doi.org/10.1109/ICCV.2007.4408933). Depths that no o
 
 The first depths are searched twice. In the first search windows have the slant of the range's bounds. At the border of
 a photograph no silhouette bounds the visual hull, whose side is then much steeper than the real surface, and windows
-with its slant do not match. So in the second search the windows in wide ranges have the slant of the depths around
-them.
+with its slant do not match. Therefore in the second search the windows in wide ranges have the slant of the depths
+around them.
 
 From one image size to the next, planes are upsampled, pixels take over better planes of their neighbours, and each
 plane moves to the best match. A part of the information from the smaller size is kept, because its larger windows
-contain more shading. The kept part is smaller where the surface has relief, which large windows miss.
+contain more shading. The kept information is smaller where the surface has relief, which large windows miss.
 
 Each view is refined by itself, and all views are compared at the end, so the result does not depend on the order of
 threads.
@@ -91,9 +91,9 @@ def take_specks_off(
     """Replaces, in place, small separate pieces of surface (at most ``most_px`` pixels) by a smooth surface through the
     pixels around them. Returns a mask of the replaced pixels.
 
-    A piece stays if no pixels around it have a known depth, as at an outline. A piece also stays if it is adjacent to
-    other pieces that together exceed ``most_px``. In one capture the replacement of all small pieces would have lost 6
-    % of the clothes.
+    A small piece stays if no pixels around it have a known depth, as at an outline. A small piece also stays if it is
+    adjacent to other pieces that together exceed ``most_px``. In one capture the replacement of all small pieces would
+    have lost 6 % of the clothes.
     """
     specks = np.zeros(depth.shape, bool)
     mark_specks(depth, slopes, GAP_PX * pixel_mm, most_px, specks)

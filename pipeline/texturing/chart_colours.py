@@ -52,7 +52,7 @@ def chart_colours(capture: Capture, rig: Rig) -> tuple[ChartColours | None, list
 
 
 def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
-    """Computes the colour correction of each camera from its charts. Returns None and a warning if there is none."""
+    """Computes the colour correction of each camera from its charts. Returns None and a warning without a chart."""
     found = {name: chart_correction(visible) for name, visible in charts.items() if visible}
     cameras = {name: correction for name, correction in found.items() if correction is not None}
     if not cameras:

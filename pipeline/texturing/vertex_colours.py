@@ -18,7 +18,7 @@ term. The data term combines projected area and angle, the visibility of all nei
 colour from the others, and the camera's correction. The Potts term is the cost of mesh edges between different labels.
 The Potts term is highest where the views disagree, so seams avoid eyes and lips. Waechter et al. label triangles; here
 vertices are labelled, and two photographs are blended in the triangles at a seam. Belief propagation minimises the sum
-(Felzenszwalb and Huttenlocher, *Efficient Belief Propagation for Early Vision*, IJCV 2006).
+of both terms (Felzenszwalb and Huttenlocher, *Efficient Belief Propagation for Early Vision*, IJCV 2006).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -134,7 +134,7 @@ class Shown:
 
     def weigh(self, weights: Weights, views: Rig) -> tuple[Weights, UInt8[np.ndarray, " v"]]:
         """Returns the views' weights, set to 0 where the surface is probably hidden, in a view or in the mean of all
-        views. Also returns the part (skin, hair or clothes) from which each unseen vertex takes its colour."""
+        views; also returns the part (skin, hair or clothes) from which each unseen vertex takes its colour."""
         shares = np.zeros((*weights.shape, 3), np.float32)  # read where a view may colour
         for k, camera in enumerate(views):
             shares[k, weights[k] > 0] = self.shares(camera, weights[k] > 0)
@@ -428,8 +428,8 @@ def select_views(
     around: Neighbourhood,
     seam_cost: float = SEAM_COST,
 ) -> tuple[Int32[np.ndarray, " v"], Int32[np.ndarray, "v c"], Float32[np.ndarray, "v c"]]:
-    """Chooses a view for each vertex; -1 means that no view sees it. Also returns the candidate views of each vertex
-    and their quality.
+    """Chooses a view for each vertex; -1 means that no view sees it. The function also returns the candidate views of
+    each vertex and their quality.
 
     ``weights``: weights of the views by angle and distance, 0 = not seen. ``codes``: sRGB codes of every view at every
     vertex, gains applied. ``levelled``: these codes after the smooth corrections of
@@ -501,7 +501,7 @@ def find_unlike(
     weights: Plane, colours: Float32[np.ndarray, "k n 3"], regions: Sequence[Bool[np.ndarray, " n"]]
 ) -> dict[int, float]:
     """Returns the views (row indices) in which the face differs from the other views, each with its correlation to
-    them. A view that is found is left out before the next search. With only two views no view is reported. Views of the
+    them. A differing view is left out before the next search. With only two views no view is reported. Views of the
     same moment differ only by gloss and shading (correlation 0.9 to 1.0). A mouth that is open in one view gives 0.2 to
     0.6, another person -0.5 to 0.3.
 
@@ -518,7 +518,7 @@ def find_unlike(
 
 
 def _judge(weights: Plane, level: Plane) -> tuple[float, float, int]:
-    """Finds the view least like the others. Returns its relative correlation, its correlation and its row."""
+    """Finds the view least like the others. Returns this view's relative correlation, correlation and row."""
     alike = _likeness(weights, level)
     if np.isnan(alike).all():
         return np.inf, np.nan, 0

@@ -177,8 +177,8 @@ def differences(
 def fill_slots(
     labels: np.ndarray, views: np.ndarray, shares: np.ndarray, slots: int
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Returns the chosen view of each vertex and the views with the next largest shares (v, slots; -1: none). Also
-    returns their shares, scaled to sum 1."""
+    """Returns the chosen view of each vertex and the views with the next largest shares (v, slots; -1: none). The
+    function also returns the views' shares, scaled to sum 1."""
     count, most = views.shape
     found = np.full((count, slots), -1, np.int32)
     weight = np.zeros((count, slots), np.float32)

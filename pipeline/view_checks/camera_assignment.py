@@ -201,8 +201,8 @@ def _touches(
     camera: Camera, hulls: Sequence[Float[np.ndarray, "_ 2"]], index: int, cameras: Sequence[Camera]
 ) -> tuple[Float[np.ndarray, "h n 2"], Float[np.ndarray, "h n 2"]]:
     """Computes, for each silhouette in this camera, the angles (rad) of the two planes through this and each other
-    camera's centre that are tangent to the silhouette. Also returns the change of angle per pixel. The values are NaN
-    for a tangent beyond the image border."""
+    camera's centre that are tangent to the silhouette. The function also returns the change of angle per pixel. The
+    values are NaN for a tangent beyond the image border."""
     pixels, ends = np.concatenate(hulls), np.cumsum([0, *map(len, hulls)])
     rays = camera.rays_world(pixels)
     k = camera.intrinsics

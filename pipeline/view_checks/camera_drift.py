@@ -8,8 +8,8 @@ image, so all equations of this camera give the same shift.
 A loose mask is too large on every side, while a shifted image is off in one direction; tangencies on opposite sides
 distinguish these causes. In a close-up most tangencies are on one side, and both causes are possible: the camera is
 reported with both, and its view is still used. Strands of hair that only some cameras resolve would cause errors of
-several pixels. So the planes are tangent to a curve that lies inside the outline by the same distance in mm for every
-camera.
+several pixels. Therefore the planes are tangent to a curve that lies inside the outline by the same distance in mm for
+every camera.
 
 The module returns the cameras that have moved, with the size and the significance of the shift.
 """

@@ -68,7 +68,7 @@ def _diameters_mm(
     solid: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig, up_world: Vector, face: FaceEvidence | None
 ) -> list[float]:
     """Returns the head's diameter (mm) in each view whose outline lies at the head's position in the other views or at
-    the face. Returns none if these views are less than ``MIN_MEETING`` of the views that show a crown."""
+    the face. Returns no diameter if these views are less than ``MIN_MEETING`` of the views that show a crown."""
     found = {name: crown_disc(mask, turns_to_upright(rig[name], up_world)) for name, mask in solid.items()}
     discs = {name: disc for name, disc in found.items() if disc is not None}
     point = _middle(discs, rig) if face is None else face.centre_world
@@ -151,8 +151,8 @@ def judge_head_size(
     guards: Guards = STRICT,
     masks_given: bool = False,
 ) -> list[ReportWarning]:
-    """Returns a warning if the head is unusually large or small. Refuses with WrongScale if its size is impossible,
-    unless a face of a human's size was found.
+    """Returns a warning if the head is unusually large or small. Refuses with WrongScale if the head's size is
+    impossible, unless a face of a human's size was found.
 
     Args:
         silhouettes: by camera; unusable ones are ignored.

@@ -4,8 +4,8 @@ faults, since all heads' crowns are equally far from the middle of their picture
 
 The faults appear in the reprojection errors of subject points in three or more views. The first estimated number, with
 its standard deviation, is a factor on all distortion coefficients: 1 if they fit the pictures, 0 if the pictures are
-undistorted. For a rig without coefficients the first number is a radial coefficient of all cameras. The second
-estimated number is a common shift of all principal points, equally to the right and down.
+undistorted. For a rig without coefficients the first estimated number is a radial coefficient of all cameras. The
+second estimated number is a common shift of all principal points, equally to the right and down.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -49,7 +49,7 @@ class _Offset(NamedTuple):
 
 
 def judge_moments(subject: SubjectFaces | None, rig: Rig) -> list[ReportWarning]:
-    """Returns a warning for each view that shows another moment or person. A view that is found is removed before the
+    """Returns a warning for each view that shows another moment or person. A view with a warning is removed before the
     next search. If only three views exist, all that differ are named, since each of them may be wrong."""
     face, odd = None if subject is None else subject.matched, list[_Offset]()
     if subject is None or face is None:

@@ -124,8 +124,8 @@ def usable_views(
 def without_moved_cameras(
     silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> tuple[dict[str, Silhouette], dict[str, ReportWarning]]:
-    """Marks the views of cameras that moved since the calibration as not usable. Also returns warnings by camera, for
-    cameras that moved and for cameras whose mask may be loose."""
+    """Marks the views of cameras that moved since the calibration as not usable. The function also returns warnings by
+    camera, for cameras that moved and for cameras whose mask may be loose."""
     kept, warnings = dict(silhouettes), dict[str, ReportWarning]()
     for drift in find_drift(silhouettes, rig):
         if drift.moved:

@@ -324,7 +324,7 @@ def _write_meshes(folder: Path, comparison: Comparison, colours: UInt8[np.ndarra
 
 
 def comparison_pdf(document: Mapping[str, Any], rows: Sequence[tuple[str, Sequence[Resized]]]) -> bytes:
-    """Returns the comparison as PDF. The same document and pictures give the same bytes.
+    """Returns the comparison as PDF. The same document and pictures give the same bytes of the PDF.
 
     Args:
         document: the content of compare.json.

@@ -1,5 +1,5 @@
-"""Measures a finished head for the fitting of helmets, masks and spectacles, with standard deviations. Also chooses the
-size of such a product: it computes the probability of each size from a measure and its standard deviation.
+"""Measures a finished head for the fitting of helmets, masks and spectacles, with standard deviations. The module also
+chooses the size of a product: it computes the probability of each size from a measure and its standard deviation.
 
 Measures have the names of ISO 7250-1 and ISO 8559-1 where these standards define one (``ISO_NAMES``). Before measuring,
 the head is turned until its Frankfurt plane is horizontal (``anatomical_frame``), as people hold their heads:

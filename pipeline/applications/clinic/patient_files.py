@@ -93,7 +93,7 @@ def write_patient_mesh(
 
 def marked_points(path: Path | None, visit: Visit, axes: Axes) -> dict[str, Float[np.ndarray, " 3"]]:
     """Returns the points of the Frankfurt plane that a point list contains, in the world frame. The list's coordinates
-    are those of head.ply in an export without the Frankfurt plane. Raises InputError if the list cannot be used."""
+    are those of head.ply in an export without the Frankfurt plane. Raises InputError if the point list is unusable."""
     if path is None:
         return {}
     world_from_patient = head_axes(visit.measured, axes).patient_from_world.inverse()

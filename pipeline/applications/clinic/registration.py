@@ -2,11 +2,11 @@
 skull and airways.
 
 The motion is rigid: photographs and CT both measure in millimetres, and a scale would hide errors that should be
-visible. If the CT surface has landmarks, the search starts from them. Otherwise the search starts from the head in the
-Frankfurt plane, rotated by up to ``TURNS_DEG``, with the face at many places of the surface, because patients lie in a
-scanner upright within some tens of degrees. From the best starts, a trimmed robust fit of the face is computed. The
-result is the fit with the largest part of the face on the CT surface. Parts outside the face may differ: soft tissue on
-another day, a chin rest, a field of view that ends at the forehead, surfaces of skull and airways.
+visible. If the CT surface has landmarks, the search starts from them. Without landmarks the search starts from the head
+in the Frankfurt plane, rotated by up to ``TURNS_DEG``, with the face at many places of the surface, because patients
+lie in a scanner upright within some tens of degrees. From the best starts, a trimmed robust fit of the face is
+computed. The result is the fit with the largest part of the face on the CT surface. Parts outside the face may differ:
+soft tissue on another day, a chin rest, a field of view that ends at the forehead, surfaces of skull and airways.
 
 Only the fraction ``share`` of the matched points, the nearest ones, enters the fit (trimmed ICP, Chetverikov et al.
 2002), and Tukey's biweight removes outliers among them. Points are not matched with a surface that faces the other way,
@@ -202,8 +202,8 @@ class PatientSurface:
 
 
 def read_surface(path: Path, axes: Axes | None = None) -> PatientSurface:
-    """Reads a CT surface from a .ply, .obj, .glb or .stl file. Its axes are ``axes`` or, without them, those in the
-    file's header (``SPACE=RAS``, as 3D Slicer writes it), otherwise LPS. Raises InputError that lists every fault."""
+    """Reads a CT surface from a .ply, .obj, .glb or .stl file. The CT axes are ``axes`` or, without them, those in the
+    file's header (``SPACE=RAS``, as 3D Slicer writes it), else LPS. Raises InputError that lists every fault."""
     mesh, _ = welded(read_mesh(path, SURFACE_ENDINGS))
     data = path.read_bytes()
     found: Axes | None = next((stated for stated in AXES if f"SPACE={stated}".encode() in data[:HEADER_BYTES]), None)

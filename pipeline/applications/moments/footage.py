@@ -53,7 +53,7 @@ class Footage:
 
     def read(self, first: int = 0, cameras: Sequence[str] = ()) -> Iterator[Pictures]:
         """Yields the reduced pictures of every frame from ``first`` on; without ``cameras``, of all cameras. Missing
-        and damaged pictures are left out."""
+        and damaged pictures are left out of the result."""
         names = cameras or self.rig.names
         with ExitStack() as stack:
             of_names = {name: path for name, path in self.videos.items() if name in names}

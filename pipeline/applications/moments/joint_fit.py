@@ -1,16 +1,16 @@
 """Estimates one identity common to several captures, together with the pose, expression and cameras of each capture.
 
-The input is the contour solver's solution for every capture, fitted to outlines or photographs. The output is the same
-solutions with one common identity. The identity's coefficients and the logarithm of scale are shared; each other
-unknown belongs to one capture. The normal equations therefore have the form of an arrow: a shared block, and one block
-for each capture (module ``arrow``).
+The input is the contour solver's solution for every capture, fitted to outlines or photographs. The output is each
+capture's solution with one common identity. The identity's coefficients and the logarithm of scale are shared; each
+other unknown belongs to one capture. The normal equations therefore have the form of an arrow: a shared block, and one
+block for each capture (module ``arrow``).
 
 The cost is the sum of the captures' costs. Each capture's cost contains the prior of the shared unknowns, so the sum
-contains this prior K times for K captures. With independent errors, the prior should count once. However, the errors of
-cameras, light, hair and head model are the same in all captures. If the fraction ``COMMON`` of the error variance is
-common, K captures are worth K / (1 + COMMON (K - 1)) independent ones; the prior should therefore count 1 + COMMON
-(K - 1) times. When the prior counted once, the joint head of eight captures from three cameras was no better than the
-mean of the separate heads.
+contains this prior K times for K captures. If the captures' errors were independent, the prior should count once. The
+errors of cameras, light, hair and head model are the same in all captures. If the fraction ``COMMON`` of the error
+variance is common, K captures are worth K / (1 + COMMON (K - 1)) independent ones; the prior should therefore count 1 +
+COMMON (K - 1) times. When the prior counted once, the joint head of eight captures from three cameras was no better
+than the mean of the separate heads.
 
 A capture whose photographs lack detail has no fine modes; it contributes only to the modes that it has."""
 

@@ -140,7 +140,7 @@ class ShapePrior:
 
 
 def follow(head: LiveHead, pictures: Mapping[str, ImageRgb], networks: FaceNetworks) -> LiveHead | None:
-    """Returns the same person's head in the next pictures. Returns None if the head is lost."""
+    """Returns the same person's head in the next pictures. Returns None if the head is not found in these pictures."""
     who, person = head.who, head.who.person
     motion, points, found, strangers = head.motion, head.points_world, head.sighting, tuple[str, ...]()
     for _ in range(LOOKS):

@@ -5,10 +5,10 @@ At each vertex, y_k is the difference between the head of capture k and the head
     y_k = u + sum_e w_ke d_e + noise,    u ~ N(0, r^2),    d_e ~ N(0, (OWN |S_e|)^2)
 
 Here the relief u is common to all captures, d_e is the difference between the person's blendshape e and the head
-model's S_e, and w_ke are the expression weights. The noise has the standard deviation that the fit of each head states.
-Cameras, hair and light make a fraction ``COMMON`` of the noise variance the same in all captures; averaging over
-captures does not reduce this fraction. Each vertex is computed separately; the results are smooth because the heads are
-smooth. All distributions are Gaussian, so the K x K covariance of the y_k at each vertex suffices."""
+model's S_e, and w_ke are the expression weights. Each head's noise has the standard deviation that the head's fit
+states. Cameras, hair and light make a fraction ``COMMON`` of the noise variance the same in all captures; averaging
+over captures does not reduce this fraction. Each vertex is computed separately; the results are smooth because the
+heads are smooth. All distributions are Gaussian, so the K x K covariance of the y_k at each vertex suffices."""
 
 from dataclasses import dataclass
 

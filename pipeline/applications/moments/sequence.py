@@ -1,11 +1,11 @@
 """Tracks a head through a sequence: estimates one identity, and the pose and expression of every frame.
 
-The identity is estimated from the sharpest frames of the first second (``sequence_person``). Then each frame is fitted,
-starting from the motion extrapolated from the previous frames (``track_frame``). A lost head is searched in the whole
-pictures; if no head is found, the frame counts as failed and is interpolated. At the end, pose and weights are smoothed
-over time (``smoothing``).
+The identity is estimated from the sharpest frames of the first second (``sequence_person``). After the person's head is
+known, each frame is fitted, starting from the motion extrapolated from the previous frames (``track_frame``). A lost
+head is searched in the whole pictures; if no head is found, the frame counts as failed and is interpolated. After the
+last frame, pose and expression weights are smoothed over time (``smoothing``).
 
-Results are stored in chunks of frames, each written under a temporary name first. No chunk depends on another one: a
+Results are stored in chunks of frames, each written under a temporary name first. No chunk depends on another chunk: a
 run after an interruption computes only the missing chunks, and several processes can divide them with the same result.
 """
 
@@ -77,7 +77,7 @@ class Tracker:
     networks: FaceNetworks
 
     def track(self, pictures: Pictures, start: Motion) -> Tracked | None:
-        """Fits one frame, starting from a predicted motion. Returns None if the head is not found."""
+        """Fits one frame, starting from a predicted motion. Returns None if the head is not found in the frame."""
         if len(pictures) < MIN_VIEWS:
             return None
         found = self.fit(pictures, start)
@@ -273,7 +273,7 @@ def _kept_person(path: Path, footage: Footage, model: HeadModel) -> SequencePers
 
 
 def write_arrays(path: Path, **arrays: Any) -> None:
-    """Writes arrays as .npz, under a temporary name first. Equal arrays give equal bytes."""
+    """Writes arrays as .npz, under a temporary name first. Equal arrays give files with equal bytes."""
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **arrays)
     write_atomically(path, buffer.getvalue())

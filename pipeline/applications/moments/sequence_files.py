@@ -59,8 +59,8 @@ def make_sequence(
     share: tuple[int, int] = (1, 1),
 ) -> dict[str, Any] | None:  # fmt: skip
     """Tracks the head of a sequence and writes the ``FILES`` into ``out``; with ``usd``, also sequence.usdc. Returns
-    the content of report.json. With a ``share`` (k, n) it tracks part k of n of the frames, and returns None while
-    frames of other shares are missing. Raises InputError for an invalid folder, every error of ``reconstruct``,
+    the content of report.json. With a ``share`` (k, n) the function tracks part k of n of the frames, and returns None
+    while frames of other shares are missing. Raises InputError for an invalid folder, every error of ``reconstruct``,
     UnknownModel or BadModel, NoUsd, and OSError."""
     if usd:
         check_usd()

@@ -1,6 +1,6 @@
 """Estimates the head of the person in a sequence jointly from several frames of the first second.
 
-The input is the sequence's footage. The output is the neutral head, the displacements of its vertices by each
+The module's input is the sequence's footage. The output is the neutral head, the displacements of its vertices by each
 expression, the corrected cameras, and the pose and weights in each frame used."""
 
 from collections.abc import Callable

@@ -1,6 +1,6 @@
 """Reconstructs a take (several captures of one person) with one common identity.
 
-Each capture runs the stages of a single job up to the fit to photographs. Then one joint fit estimates the common
+Each capture runs the stages of a single job up to the fit to photographs. A joint fit then estimates the common
 identity (``joint_fit``); afterwards each capture continues to its fine surface, colours and evidence. The heads of all
 captures have corresponding vertices; the person's neutral head and blendshapes are computed from them (``own_shapes``).
 """

@@ -123,7 +123,7 @@ class LinearisedWeightPrior:
         return float((self.weights**2).sum() + 2.0 * TAIL * np.log1p(self.weights / EXPRESSION_MEDIAN).sum())
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds the prior to the normal equations, in place."""
+        """Adds the prior on expression weights to the normal equations, in place."""
         rows = np.arange(POSE, POSE + len(self.weights))
         equations.matrix[rows, rows] += 1.0
         equations.gradient[rows] += self.weights + weight_slope(np.maximum(self.weights, 0.0))

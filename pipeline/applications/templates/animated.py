@@ -3,7 +3,7 @@ blendshapes, rotation centres (pivots) and, if its mesh lacks them, eyeballs, te
 visemes and blendshapes without crossing triangles.
 
 The lips of a fitted head may be some tenths of a millimetre apart, and teeth would show through the gap. A gap of this
-size is closed; a wider gap counts as an open mouth and does not change. The inner edge of open lips is smoothed.
+width is closed; a wider gap counts as an open mouth and does not change. The inner edge of open lips is smoothed.
 
 A head model's expressions move a template as follows: each skin vertex moves with the head model's triangle to which it
 is attached (``carrying``). Vertices below the skin are attached too if mesh edges connect them to the skin over
@@ -13,7 +13,7 @@ displacement of their neighbours in the mesh. Parts of the mesh that no edge con
 
 - Eyeballs are round and closed, and no blendshape moves them: an animator rotates them about their pivots.
 - Lashes and brows stand on the skin, and rotate with the skin triangle at their roots.
-- Teeth and tongue lie inside the head. Below the line between the lips they move with the jaw, above it with the skull.
+- Teeth and tongue lie inside the head. Below the line between the lips both move with the jaw, above it with the skull.
 """
 
 from collections.abc import Mapping

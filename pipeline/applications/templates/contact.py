@@ -60,7 +60,7 @@ def rest_surface(vertices: Vertices, faces: Int[np.ndarray, "f 3"]) -> RestSurfa
 
 def kept_apart(rest: RestSurface, displacement: Vertices, *, closing: bool) -> Vertices:
     """Returns a blendshape's displacement (mm, at weight 1) with the smallest change that leaves as few new crossings
-    of triangles at ``WEIGHTS`` as possible. If ``closing``, the shape closes the lids, which stop where they meet;
+    of triangles at ``WEIGHTS`` as possible. If ``closing``, the blendshape closes the lids, which stop where they meet;
     otherwise vertices on both sides of a crossing move together."""
     spot = crossing_vertices(rest, displacement, WEIGHTS[1::2])
     best, fewest, zone = displacement, np.count_nonzero(spot), np.zeros(len(rest.vertices), bool)

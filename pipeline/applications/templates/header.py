@@ -1,6 +1,6 @@
 """Lists the registered templates, which are files in the folder ``templates`` of the data folder. Reads the header of a
-template's file without its arrays, and checks whether a job may use the template. This module loads no head model,
-because the command line, the service and the console call it before any job starts."""
+template's file without its arrays, and checks whether a job may use the template. The module ``header`` loads no head
+model, because the command line, the service and the console call it before any job starts."""
 
 import json
 from collections.abc import Mapping
@@ -41,7 +41,7 @@ def is_name(name: str) -> bool:
 
 
 def templates_folder() -> Path:
-    """Returns the folder that holds the registered templates. The folder may not exist yet."""
+    """Returns the folder that holds the registered templates. The returned folder may not exist yet."""
     return data_folder() / "templates"
 
 
@@ -132,7 +132,7 @@ def read_header(path: Path) -> TemplateHeader:
 
 
 def read_meta(path: Path, file: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Returns the decoded ``meta`` entry of an open template file. Raises BadTemplate for files of another kind."""
+    """Returns the decoded ``meta`` entry of an open template file. Raises BadTemplate if the file is no template."""
     if "meta" not in file:
         raise BadTemplate(path, compose("template-without-format"))
     meta = json.loads(file["meta"].tobytes())
@@ -142,7 +142,7 @@ def read_meta(path: Path, file: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def header_words(meta: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the text fields of a template's header from its ``meta`` entry. Raises KeyError if a field is missing."""
+    """Returns the text fields of a template's header from its ``meta`` entry. Raises KeyError for a missing field."""
     return {word: str(meta[word]) for word in WORDS}
 
 

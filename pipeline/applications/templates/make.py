@@ -30,7 +30,7 @@ def make_template(
     report: Progress,
 ) -> tuple[Template, Registration]:
     """Registers a mesh to a head model; the mesh comes from an OBJ file or a FLAME model's file. Returns the template
-    and the registration. Raises InputError that lists every fault of the file."""
+    and the registration. Raises InputError that lists every fault of the mesh file."""
     flame = read_flame(path) if path.suffix.lower() in SUFFIXES else None
     mesh = read_polygons(path) if flame is None else _polygons(flame)
     found = register(mesh, model, name=path.name, landmarks=landmarks, report=report)
@@ -62,7 +62,7 @@ NAMES = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintr
 
 
 def read_flame(path: Path) -> FlameModel:
-    """Returns the FLAME model stored in a file. Raises InputError that lists every fault."""
+    """Returns the FLAME model stored in a file. Raises InputError that lists every fault of the FLAME file."""
     arrays = read_pickled_arrays(path) if path.suffix.lower() == ".pkl" else _archive(path)
     faults = [compose("flame-array-missing", name=name) for name in NAMES if name not in arrays]
     faults = faults or [*_unfit(arrays)] or [*_not_finite(arrays)]

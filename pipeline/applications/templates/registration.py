@@ -1,6 +1,6 @@
 """Registers another program's mesh to a head model once, so that the mesh can deform with fitted heads.
 
-The head model is fitted to the mesh as closely as possible (``fit_model_to_mesh``). Then
+The head model is fitted to the mesh as closely as possible (``fit_model_to_mesh``). After this placement
 ``geometry.registration.nonrigid`` deforms the mesh's skin onto the fitted head, so that the difference between mesh and
 fitted head does not appear in results. Finally, every skin vertex gets its point on the head model's surface, and
 deeper vertices follow the skin (``carrying``)."""
@@ -200,7 +200,7 @@ def parting(
     attachment: Attachment, rest: Vertices, skin: Flags, faces: Int[np.ndarray, "f 3"], model: HeadModel
 ) -> Flags:
     """Returns a mask of the vertices that move away from their neighbours on at least one random head. A vertex that
-    does was attached to the wrong layer of the surface, such as the inside of a lid or the eyeball."""
+    moves away was attached to the wrong layer of the surface, such as the inside of a lid or the eyeball."""
     graph = _graph(faces[skin[faces].all(axis=1)], len(rest))
     graph = sparse.csr_array(((graph + graph.T) > 0).astype(float))
     degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1.0)[:, None]

@@ -1,11 +1,11 @@
 """Aligns a measured head to its reference scan by the rigid motion that minimises the squared distances to the surface.
 
-The reference scan may be in any frame. The motion starts from landmarks if head and scan both have them. Otherwise many
-starts are tried: rotations in all directions, with the head's centre at the centres of parts of the scan. The start
-with the best fit of the face is chosen. Gauss-Newton steps on the distances along the reference's normals over the
-face, weighted by area, refine the motion (``pipeline.geometry.registration``). This is the best fit of the standard
-VDI/VDE 2634, which does not correct size. The size error is then estimated by the same steps with a scale, and only
-reported."""
+The reference scan may be in any frame. The motion starts from landmarks if head and scan both have them. Without known
+landmarks many starts are tried: rotations in all directions, with the head's centre at the centres of parts of the
+scan. The start with the best fit of the face is chosen. Gauss-Newton steps on the distances along the reference's
+normals over the face, weighted by area, refine the motion (``pipeline.geometry.registration``). The module computes the
+best fit of the standard VDI/VDE 2634, which does not correct size. The size error is then estimated by the same steps
+with a scale, and only reported."""
 
 from dataclasses import dataclass
 

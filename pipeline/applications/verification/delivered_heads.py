@@ -9,8 +9,8 @@ The heads update the population, each vertex according to its accuracy. Mean and
 normal-inverse-Wishart prior from the old model (K. Murphy, *Conjugate Bayesian analysis of the Gaussian distribution*,
 2007, section 8), which counts as a given number of heads. The reconstructed heads contain errors. Each head is
 therefore replaced by its expected shape in the population, given its standard deviations, together with the covariance
-of this shape: a step of expectation maximisation for a Gaussian with known noise. Without this step, errors in places
-that a rig's cameras cannot see would count as variation between people."""
+of this shape: a step of expectation maximisation for a Gaussian with known noise. Without this expectation step, errors
+in places that a rig's cameras cannot see would count as variation between people."""
 
 import os
 from dataclasses import dataclass, replace
@@ -56,7 +56,7 @@ class Delivered:
 
 
 def updated_model(parts: ModelParts, delivered: Delivered, *, name: str, report: Progress) -> ModelParts:
-    """Returns the head model ``parts`` after it was updated with heads that were reconstructed with it. Its figures
+    """Returns the head model ``parts`` after it was updated with heads that were reconstructed with it. The figures
     include the mean distance (mm) between a face and the modes' span before and after, with each head held out once."""
     known = Population(parts.mean.astype(float), parts.modes.astype(float))
     weights = above_neck(known.mean, parts.landmarks)
@@ -172,7 +172,7 @@ def build_from_results(folder: Path, out: Path, *, name: str, report: Progress =
 
 def find_results(folder: Path) -> tuple[Path, ...]:
     """Returns the folders of all results in or below ``folder``, sorted; links are followed, and each result is listed
-    once. Raises InputError if there is no result."""
+    once. Raises InputError if the folder contains no result."""
     places: dict[str, Path] = {}
     for place, below, _ in os.walk(folder, followlinks=True):
         if places.setdefault(os.path.realpath(place), Path(place)) != Path(place):

@@ -19,8 +19,8 @@ are compared. The heads are aligned by rigid motions, without scale, to their me
 is recomputed (generalised Procrustes analysis without scale; Gower 1975, https://doi.org/10.1007/BF02291478).
 
 The default limits are about one and a half times the values that a bare mannequin from outside the head model's
-population gives in the simulated studio (tests/laboratory/notes/verification.md). Rigs without faults pass, and rigs
-with a permanent fault do not."""
+population gives in the simulated studio (tests/laboratory/notes/verification.md). With these limits rigs without faults
+pass, and rigs with a permanent fault do not."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -179,7 +179,7 @@ class Judgement:
 
 
 def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) -> Judgement:
-    """Judges heads of one subject and head model against the reference scan. Raises InputError if it shows another."""
+    """Judges heads of one subject against a reference scan. Raises InputError if the scan shows another subject."""
     captures = tuple(judge_one(one, reference) for one in measured)
     first = measured[0]
     deviations = np.stack([one.deviation_mm for one in captures])

@@ -43,7 +43,7 @@ class Reference:
         cls, mesh: Mesh, landmarks: Mapping[str, Float[np.ndarray, " 3"]], name: str = "reference", sha256: str = ""
     ) -> "Reference":
         """Checks a mesh and prepares it as a reference. The mesh must not contain repeated vertices. Raises InputError
-        that lists every fault."""
+        that lists every fault of the mesh."""
         faults = [*_surface_faults(mesh), *_landmark_faults(mesh, landmarks)]
         if faults:
             raise InputError(name, faults)
@@ -64,7 +64,7 @@ class Reference:
 
 def read_reference(path: Path, landmarks: Path | None = None) -> Reference:
     """Reads a scan with its landmarks: from the file ``landmarks`` or, if None, from a file of the same name beside the
-    scan, if it exists. Raises InputError that lists every fault."""
+    scan, if it exists. Raises InputError that lists every fault of the file."""
     mesh, _ = welded(read_mesh(path))
     landmarks_path = landmarks or landmark_file(path)
     marks = {} if landmarks_path is None else read_landmarks(landmarks_path)

@@ -89,7 +89,7 @@ def scale_end(deviation_mm: Float[np.ndarray, " n"]) -> float:
 
 def heat_colours(deviation_mm: Float[np.ndarray, " v"], end_mm: float) -> UInt8[np.ndarray, "v 3"]:
     """Returns a colour for each deviation: blue where the result lies inside the reference, red outside, white where
-    they agree, grey where the deviation is unknown. The colours saturate at ``end_mm``."""
+    they agree, grey where the deviation is unknown. The colours saturate at an error of ``end_mm``."""
     place = np.clip(np.nan_to_num(deviation_mm) / end_mm, -1.0, 1.0)
     stops = np.linspace(-1.0, 1.0, len(RAMP))
     colours = np.stack([np.interp(place, stops, RAMP[:, channel]) for channel in range(3)], axis=1)
@@ -116,7 +116,7 @@ def write_verification(
 
 
 def certificate_pdf(report: VerificationReport, judgement: Judgement, pictures: Pictures) -> bytes:
-    """Returns the certificate as a PDF of two pages. The same report and pictures give the same bytes."""
+    """Returns the certificate as a PDF of two pages. The same report and pictures give the same bytes of the PDF."""
     pdf = PdfPage("eigenhead: verification of a studio", report["date"])
     pdf.add_page()
     _figures_page(pdf, report, judgement)

@@ -3,8 +3,8 @@ and distances are measured.
 
 The face is detected in rendered pictures, for any unit and axes of the scan. The scan is rendered from all sides until
 one picture shows a face; the detector accepts any roll of the picture. The detected face points are projected onto the
-scan; their size determines the unit, and their arrangement the axes. Then the scan is rendered from seven directions in
-front of that face, like photographs of a rig, and the face is detected and matched in these pictures as in a capture.
+scan; their size determines the unit, and their arrangement the axes. The placed scan is rendered from seven sides in
+front of that face, like photographs of a rig, and the face is detected and matched in these pictures.
 
 Next, the head model is fitted to the scan, as in a template's registration (``templates``). Last, the template's
 vertices are deformed as in ``geometry.registration.nonrigid``, with exact closest points on the scan's triangles."""
@@ -167,7 +167,7 @@ def _pictures(rig: Rig, mesh: Mesh, light: Light, renderer: Renderer) -> dict[st
 def _lifted(
     face: FaceDetection, camera: Camera, depth: Float[np.ndarray, "h w"], small_from_scan: Similarity
 ) -> _Glance | None:
-    """Projects the detected points of a face onto the scan. Returns None if too few points lie on the scan."""
+    """Projects the detected points of a face onto the scan. Returns None if too few of these points lie on it."""
     columns, rows = np.clip(np.rint(face.landmarks_px).astype(int), 0, SEARCH_PX - 1).T
     away = depth[rows, columns].astype(float)
     hit = np.isfinite(away)
@@ -259,8 +259,8 @@ def drawn_onto(
 
 
 def _near_face(points: Float[np.ndarray, "n 3"], model: HeadModel) -> Bool[np.ndarray, " n"]:
-    """Returns a mask of the points of a registered template that lie near the face of the mean head. If such points are
-    not skin, they belong to the mouth, the nose or the eye sockets."""
+    """Returns a mask of the points of a registered template that lie near the face of the mean head. Points there that
+    show no skin belong to the mouth, the nose or the eye sockets."""
     mean = model.vertices(np.zeros(0))
     return KDTree(mean[model.levels["full"].face_region]).query(points)[0] < FACE_MM
 

@@ -1,6 +1,6 @@
 """Deforms a mesh smoothly onto another surface by non-rigid closest points (Amberg, Romdhani and Vetter 2007); each
-step is linear in the displacements. Also warps points by landmarks (the paper's section 3.2, step 3: scattered-data
-interpolation).
+step is linear in the displacements. The module also warps points by landmarks (the paper's section 3.2, step 3:
+scattered-data interpolation).
 
 The warp uses the distance itself as its radial kernel, which minimises bending in three dimensions (F. Bookstein's thin
 plate in 3-D; Carr et al. 2001, *Reconstruction and Representation of 3D Objects with Radial Basis Functions*, section

@@ -2,9 +2,9 @@
 
 Matting must know the background behind the subject's border. With a plain backdrop the pixels beside the subject give a
 good estimate. With a cluttered background, or one of the subject's colour, the estimate is bad, and a coarse mask may
-be 10 cm too wide. If the estimate is bad, the mask is cut along image edges instead: windows along the outline are
-segmented one by one with local colours (Rother et al., *GrabCut*, SIGGRAPH 2004, in OpenCV), and overlapping windows
-are averaged (Bai et al., *Video SnapCut*, 2009).
+be 10 cm too wide. If the background's estimate is bad, the mask is cut along image edges instead: windows along the
+outline are segmented one by one with local colours (Rother et al., *GrabCut*, SIGGRAPH 2004, in OpenCV), and
+overlapping windows are averaged (Bai et al., *Video SnapCut*, 2009).
 """
 
 from collections.abc import Callable, Mapping

@@ -1,15 +1,15 @@
 """Finds coarse masks of all views together, from colour models and from the consistency between views.
 
 The search starts with a disc of certain subject around the point to which all cameras are directed. The image border is
-background, except at the bottom, where the body leaves the image. Then two steps alternate: colour models give log
-odds, and the views are combined in a voxel volume. A view's background colours are first learned from the image border.
-Later the background colours are learned from pixels outside its mask that other views also exclude, so that a coat
-which is not yet in the mask does not become background.
+background, except at the bottom, where the body leaves the image. After this start two steps alternate: colour models
+give log odds, and the views are combined in a voxel volume. A view's background colours are first learned from the
+image border. Later the background colours are learned from pixels outside its mask that other views also exclude, so
+that a coat which is not yet in the mask does not become background.
 
 Each view has its own background colours. The subject's colour density is the mean of two densities, over all views and
 over the view alone, since the light may differ between views. If subject and background have similar colours (a grey
-coat in front of a grey wall), local colours distinguish them better. So each histogram is combined with a Gaussian of
-the colours in a window (as in Bai et al., *Video SnapCut*, SIGGRAPH 2009).
+coat in front of a grey wall), local colours distinguish them better. Therefore each histogram is combined with a
+Gaussian of the colours in a window (as in Bai et al., *Video SnapCut*, SIGGRAPH 2009).
 """
 
 from collections.abc import Callable, Mapping

@@ -35,9 +35,9 @@ class ViewingVolume:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OtherViews:
-    """Holds the evidence of all other views for each pixel of one view. ``support`` is the largest sum of their log
-    odds at a voxel on the pixel's ray (negative if they exclude the subject). ``solid`` is True if no other view doubts
-    some voxel on the ray."""
+    """Holds the evidence of all other views for each pixel of one view. ``support`` is the largest sum of the other
+    views' log odds at a voxel on the pixel's ray (negative if they exclude the subject). ``solid`` is True if no other
+    view doubts some voxel on the ray."""
 
     support: Float32[np.ndarray, "h w"]
     solid: Bool[np.ndarray, "h w"]

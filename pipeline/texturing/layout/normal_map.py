@@ -79,7 +79,7 @@ SIZE_PX = 1024  # 4.5 texels from a vertex of the full level to the next; the bu
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalMapped:
     """Holds a reduced mesh (mm) with texture coordinates, normals, tangents and its normal map. ``rows`` are the
-    indices of its vertices in the full mesh."""
+    indices of the kept vertices in the full mesh."""
 
     mesh: Mesh
     rows: Int[np.ndarray, " n"]

@@ -6,10 +6,10 @@ skin, a few millimetres wide, shading multiplies each Fourier component of the r
 shading can be inverted to the relief. Waves at right angles to g do not change the shading, so their height is
 estimated near zero.
 
-Pictures have noise and highlights, and the geometry and the cameras are off by a pixel. So the views are split into two
-disjoint sets, and the image shift between the sets is removed. For each patch and octave of wavelength, a Wiener filter
-keeps the fraction of the power that both sets share. The Wiener filter does not separate colour from relief; ``COLOUR``
-is the fraction of the colour's variation that counts as shading.
+Pictures have noise and highlights, and the geometry and the cameras are off by a pixel. Therefore the views are split
+into two disjoint sets, and the image shift between the sets is removed. For each patch and octave of wavelength, a
+Wiener filter keeps the fraction of the power that both sets share. The Wiener filter does not separate colour from
+relief; ``COLOUR`` is the fraction of the colour's variation that counts as shading.
 
 The same filter extracts detail for the texture from the difference between pictures of full and of working size.
 """
@@ -341,8 +341,8 @@ class Patches:
         return np.exp(np.complex64(-1j * np.pi) * (fu * shifts[:, :1, None] + fv * shifts[:, 1:, None]))
 
     def repeating(self, first: Spectra, second: Spectra) -> tuple[Float32[np.ndarray, "n p q"], np.ndarray]:
-        """Returns the Wiener weight of each wave in the mean of two sets of views. Also returns, for each octave, the
-        power that both sets share and the total power."""
+        """Returns the Wiener weight of each wave in the mean of two sets of views. The function also returns, for each
+        octave, the power that both sets share and the total power."""
         common = np.real(first * np.conj(second))
         either = np.abs(first) ** 2 + np.abs(second) ** 2
         weight, powers = np.zeros(self.per_mm.shape, np.float32), np.zeros((OCTAVES, 2))
@@ -360,8 +360,8 @@ class Patches:
         return 0.5 * self.repeating(first, second)[0] * (first + second)
 
     def relief(self, first: Spectra, second: Spectra) -> tuple[Spectra, Float[np.ndarray, "o 2"]]:
-        """Returns the Fourier components of the relief, given those of the shading in two sets of views. Also returns
-        the powers from ``repeating``."""
+        """Returns the Fourier components of the relief, given those of the shading in two sets of views. The function
+        also returns the powers from ``repeating``."""
         weight, powers = self.repeating(first, second)
         noise2 = np.maximum((2 * np.pi * COLOUR * self.per_mm) ** 2, 1e-12)
         gain = weight * np.conj(self.shading) / (np.abs(self.shading) ** 2 + noise2)

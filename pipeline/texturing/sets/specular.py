@@ -2,8 +2,8 @@
 
 The lamps send polarised light. Specular reflection stays polarised; light scattered inside the skin does not. A lens
 filter crossed with the lamps' filter passes only half of the diffuse light. A parallel lens filter passes the specular
-light and half of the diffuse light (Ma et al., *Rapid Acquisition of Specular and Diffuse Normal Maps*, EGSR 2007). So,
-in linear light, ``cross`` is the diffuse part and ``parallel / exposure - cross`` the specular part.
+light and half of the diffuse light (Ma et al., *Rapid Acquisition of Specular and Diffuse Normal Maps*, EGSR 2007).
+Therefore, in linear light, ``cross`` is the diffuse part and ``parallel / exposure - cross`` the specular part.
 
 The exposures of the two pictures may differ, so their ratio is measured for each camera. Specular light is nearly grey
 in a picture with white balance, so differences between colour channels come from diffuse light. The ratio of these

@@ -100,7 +100,7 @@ def set_texture(
     size: int,
     settings: TextureSettings,
 ) -> tuple[Atlas, Float[np.ndarray, "k 3"]]:
-    """Paints a texture from one set of photographs. Also returns the gain of each camera and channel (k, 3).
+    """Paints a texture from one set of photographs; also returns the gain of each camera and channel (k, 3).
 
     ``images`` (of the set) and ``silhouettes`` are by camera. ``decision``: the views that colour each vertex.
     ``mesh_world``: the head (mm). ``size``: width of the texture in texels.

@@ -1,18 +1,18 @@
 """Brings raw scans into correspondence (the paper's section 3.2): landmark warp, cylindrical resampling, refinement.
 
-Each scan is first moved rigidly into the head frame by its landmarks. The result has the vertices and triangles of the
-default model, because modes on a scan's hundred thousand vertices would take a hundred megabytes; the paper keeps the
-scan's vertices. The functions ``on_reference`` and ``warp_and_resample`` are the paper's steps; they serve only to draw
-its figure 3. Landmarks alone leave the vertices between them free to slide along the surface. A model is therefore
-built from refined heads: the most probable head under a prior of heads, given the scan's landmarks and surface, is
-displaced smoothly along its normals onto the scan.
+Each scan is first moved rigidly into the head frame by its landmarks. A registered scan has the vertices and triangles
+of the default model, because modes on a scan's hundred thousand vertices would take a hundred megabytes; the paper
+keeps the scan's vertices. The functions ``on_reference`` and ``warp_and_resample`` are the paper's steps; they serve
+only to draw its figure 3. Landmarks alone leave the vertices between them free to slide along the surface. A model is
+therefore built from refined heads: the most probable head under a prior of heads, given the scan's landmarks and
+surface, is displaced smoothly along its normals onto the scan.
 
 The prior contains more heads than the span of a PCA. A PCA of 138 heads has 137 directions, and a head outside this
-span would be fitted with vertices at wrong positions. Two assumptions extend the sample of heads. A head and its mirror
-image are equally likely, so the covariance is averaged with the covariance of mirrored heads. Distant parts of a head
-are nearly independent, so a second covariance is multiplied by a Gaussian of the distance between vertices. The product
-keeps only the correlation of near vertices (localised models: Luethi et al. 2018, *Gaussian Process Morphable Models*,
-section 3.3). The prior mixes the original and the localised covariance.
+span would be fitted with vertices at wrong positions. Two assumptions extend the sample of scanned heads. A head and
+its mirror image are equally likely, so the covariance is averaged with the covariance of mirrored heads. Distant parts
+of a head are nearly independent, so a second covariance is multiplied by a Gaussian of the distance between vertices.
+The localised covariance keeps only the correlation of near vertices (localised models: Luethi et al. 2018, *Gaussian
+Process Morphable Models*, section 3.3). The prior mixes the original and the localised covariance.
 
 Resampling casts rays outwards from the vertical axis through the head. A ray is (angle, height): angle 0 points along
 +z (out of the face), pi/2 along +x (the subject's left); height is y. Several processes work on scans, because SuperLU
@@ -164,8 +164,8 @@ def registration_prior(
 def mirror_images(mean: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " V"] | None:
     """Returns, for each vertex, its mirror vertex across the median plane x = 0; None if the mesh is not symmetric.
 
-    The pairs are the one-to-one assignment with the least total distance. A mean head is not exactly symmetric, so
-    choosing the nearest mirrored vertex would use some vertices twice."""
+    The mirror pairs are the one-to-one assignment with the least total distance. A mean head is not exactly symmetric,
+    so choosing the nearest mirrored vertex would use some vertices twice."""
     opposite = linear_sum_assignment(cdist(mean, mean * _MIRROR, "sqeuclidean"))[1]
     edges = edges_of(faces)[0].astype(np.int64)
     across = np.sort(opposite[edges], 1)
@@ -177,8 +177,8 @@ def localised(mean: Float[np.ndarray, "V 3"], modes: Float32[np.ndarray, "M V 3"
     """Returns the ``KEPT`` strongest modes of the localised covariance: the modes' covariance times a Gaussian of the
     vertex distance on the mean head.
 
-    This matrix K is too large to store (400 MB), so its rows are computed in blocks and multiplied by a random matrix
-    P: K ~ Y (P^T Y)^-1 Y^T with Y = K P (Halko, Martinsson, Tropp 2011, section 5.5)."""
+    The covariance matrix K is too large to store (400 MB), so its rows are computed in blocks and multiplied by a
+    random matrix P: K ~ Y (P^T Y)^-1 Y^T with Y = K P (Halko, Martinsson, Tropp 2011, section 5.5)."""
     size = mean.size
     flat = modes.reshape(len(modes), size)
     probe = np.random.default_rng(0).standard_normal((size, min(KEPT + _SPARE, size))).astype(np.float32)

@@ -1,7 +1,7 @@
 """Checks raw scans for problems: units, left and right, orientation of faces, landmarks off the surface, holes.
 
 A problem with one obvious remedy (units, a mirrored file, exchanged landmark names, inverted faces) is repaired and
-reported. All other problems are faults, which are all reported. Landmarks are compared with the default model's."""
+reported. Every other problem of a scan is reported as a fault. Landmarks are compared with the default model's."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -86,7 +86,7 @@ def _in_millimetres(scan: Scan, template: HeadModel) -> tuple[Scan, list[str]]:
 
 def _sides_and_windings(scan: Scan, template: HeadModel) -> tuple[Scan, list[str]]:
     """Repairs exchanged left and right (compared with the mean head) and inverted faces (compared with the direction
-    from the axis). A scan with both problems is a mirrored file."""
+    from the axis). A scan that is both inside out and has right and left exchanged is a mirrored file."""
     marks, mean = stacked(scan.landmarks), _mean_marks(template)
     swapped = marks[[NAMES.index(mirrored(name)) for name in NAMES]]
     flipped = _misfit(swapped, mean) < 0.6 * _misfit(marks, mean)

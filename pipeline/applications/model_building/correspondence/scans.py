@@ -26,8 +26,8 @@ LANDMARK_SUFFIXES = (".json", ".mrk.json", ".pp", ".ljson")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """Holds one head as a scanner delivers it: any number of vertices, possibly with holes, in the scanner's frame.
-    Landmarks are in the same frame."""
+    """Holds one head as a scanner delivers it: any number of vertices, possibly with holes, in the scanner's frame. The
+    scan's landmarks are in the frame of its vertices."""
 
     name: str
     vertices: Float[np.ndarray, "V 3"]
@@ -49,7 +49,7 @@ def find_scans(folder: Path) -> list[Path]:
 
 
 def read_scan(path: Path) -> Scan:
-    """Returns a scan with its landmarks. Raises InputError if a file cannot be used."""
+    """Returns a scan with its landmarks. Raises InputError if the scan's files cannot be used."""
     mesh, _ = welded(read_mesh(path))
     landmarks_path = landmark_file(path)
     if landmarks_path is None:
@@ -79,7 +79,7 @@ def welded(mesh: Mesh) -> tuple[Mesh, Bool[np.ndarray, " F"]]:
 
 def read_landmarks(path: Path, axes: Axes = "LPS") -> dict[str, Float[np.ndarray, " 3"]]:
     """Returns landmarks by this project's names; other points in the file are ignored. A .mrk.json file states its own
-    axes and is converted to ``axes``. Raises InputError if the file cannot be used."""
+    axes and is converted to ``axes``. Raises InputError if the landmark file cannot be used."""
     readers = {".json": _from_json, ".pp": _from_pp, ".ljson": _from_ljson}
     try:
         is_list = path.name.lower().endswith(".mrk.json")

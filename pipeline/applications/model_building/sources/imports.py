@@ -3,9 +3,9 @@
 Every reader returns a ``Foreign`` model in millimetres and head-frame axes; ``adopt`` converts it to this project's
 form. The imported model keeps its vertices. Modes that are not orthogonal are replaced by the principal axes of the
 same Gaussian (``pca.orthogonalised``), so the probability of every head stays the same. Landmarks that the source lacks
-come from the default model, which is fitted to the imported mean head and then warped onto it. The face region follows
-from the landmarks. New triangles between existing vertices close the openings of eyes and mouth, which hides what is
-behind."""
+come from the default model, which is fitted to the imported mean head and then warped onto it. The imported model's
+face region follows from its landmarks. New triangles between existing vertices close the openings of eyes and mouth,
+which hides what is behind."""
 
 import json
 import re
@@ -110,7 +110,7 @@ _BASEL_NAMES = {
 def import_model(path: Path, *, name: str | None = None, report: Progress = discard_progress) -> ModelParts:
     """Reads a model of another format and converts it; a model file of this project only gets the new name.
 
-    A folder with exactly one model file is read as that file. Raises CannotImport if there is no readable model."""
+    A folder with exactly one model file is read as that file. Raises CannotImport without a readable model."""
     files = [f for f in path.iterdir() if f.suffix.lower() in (".npz", ".h5", ".hdf5")] if path.is_dir() else []
     files = [f for f in files if not f.name.endswith(ICT_EXPRESSIONS)]  # read with the identities beside it
     path = files[0] if len(files) == 1 else path
@@ -291,7 +291,7 @@ def _check_plain(path: Path, mean: np.ndarray, modes: np.ndarray, faces: np.ndar
 
 def adopt(foreign: Foreign, *, report: Progress = discard_progress) -> ModelParts:
     """Converts an imported model to the parts of a model file: orthogonal modes, all 26 landmarks, head frame, face
-    region, closed openings, decimated meshes. Raises CannotImport if a part cannot be computed."""
+    region, closed openings, decimated meshes. Raises CannotImport if a part of the head model cannot be computed."""
     extent = float(np.ptp(foreign.mean, axis=0).max())
     if not 100 < extent < 600:
         raise CannotImport(foreign.name, f"its mean is {extent:.3g} mm large, which no head is: convert it to mm")

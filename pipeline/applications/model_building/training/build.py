@@ -89,8 +89,8 @@ def cages_through(points: Float[np.ndarray, "N V0 3"], template: HeadModel) -> F
     """Computes coarse control meshes, called cages (mm), whose subdivision surface passes through given points.
 
     A subdivision surface lies inside its cage. The cage C must therefore solve S C = P, with the points P and the
-    subdivision matrix's rows S for the cage's vertices. S nearly removes details as fine as the cage itself, so its
-    inverse would amplify noise. A few iterations C += P - S C from the template's details avoid the noise."""
+    subdivision matrix's rows S for the cage's vertices. The matrix S nearly removes details as fine as the cage itself,
+    so its inverse would amplify noise. A few iterations C += P - S C from the template's details avoid the noise."""
     rows = template.levels["full"].operator[: len(template.mean)]
     mean = template.mean.astype(float)
     away = points - rows @ mean

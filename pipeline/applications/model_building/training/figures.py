@@ -183,8 +183,8 @@ def modes_figure(model: HeadModel, modes: int) -> Image:
 def correspondence_figure(model: HeadModel) -> Image:
     """Draws the paper's figure 3: reference, target scan, warped reference, and resampled head with its holes in red.
 
-    Each head is drawn from the front and from behind. Reference and target are random heads of the model, scanned by
-    the simulated scanner with holes."""
+    Each head is drawn from the front and from behind. The reference and the target scan are random heads of the model,
+    scanned by the simulated scanner with holes."""
     rng = np.random.default_rng(3)
     count = min(20, len(model.modes))
     faces = model.levels["full"].faces

@@ -1,7 +1,7 @@
 """Computes the content of a model file from corresponded heads: alignment, principal components, decimated meshes, face
-region. Also measures compactness, generalisation and specificity (R. Davies, *Learning Shape: Optimal Models for
-Analysing Natural Variability*, 2002, chapter 5). No single measure suffices: a model of one head is compact and
-specific, and a model that allows any shape generalises well."""
+region. The module also measures a model's compactness, generalisation and specificity (R. Davies, *Learning Shape:
+Optimal Models for Analysing Natural Variability*, 2002, chapter 5). No single measure suffices: a model of one head is
+compact and specific, and a model that allows any shape generalises well."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

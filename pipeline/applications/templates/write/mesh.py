@@ -1,5 +1,5 @@
 """Writes a fitted head as ``head-NAME.obj``, in a template's vertex order and with the template's polygons, groups and
-texture coordinates. Also writes ``head_hair-NAME.obj``, the head with its surface moved out to its hair.
+texture coordinates. The module also writes ``head_hair-NAME.obj``, the head with its surface moved out to its hair.
 
 The OBJ files are in the world frame, mm, like head.ply and head.obj. If the result has a texture and the template has
 texture coordinates, the skin is textured (head-NAME.mtl, head-NAME.jpg, and one more image for each further UDIM tile);

@@ -274,8 +274,8 @@ def _towards_irises(
     from_world: RigidTransform,
     photographed: PhotographedEyes,
 ) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns the directions from the centres of added eyeballs to the photographed irises. Each iris thus lies where
-    it was photographed. The darkest area between the open lids replaces an iris that was not measured."""
+    """Returns the directions from the centres of added eyeballs to the photographed irises. So turned, each iris lies
+    where it was photographed. The darkest area between the open lids replaces an iris that was not measured."""
     found = {}
     for name, ball in animated.added.items():
         eye = eyes.get(name.removeprefix("eye_"))
