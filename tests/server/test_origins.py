@@ -65,9 +65,9 @@ def test_a_named_origin_may_be_private_and_no_other_port_or_scheme_of_it(monkeyp
         ("file:///etc/passwd", "no https"),
         ("https:///a", "no https"),
         ("store.example/a", "no https"),
-        ("https://store.example/\x00", "no URL"),
+        ("https://store.example/\x00", "not a URL"),
         *[
-            (f"https://{host}/a", "no URL")
+            (f"https://{host}/a", "not a URL")
             for host in ("a..b", ".", "xn--", f"{'a' * 80}.example", "☃☃.example", "[::1")
         ],
         *[(f"https://{host}/a", "an impossible host") for host in ("[", "a b", "a%00b")],

@@ -1,7 +1,7 @@
 """Messages about batches, and about files of settings."""
 
 TEMPLATES = {
-    "settings-unreadable": "the settings file cannot be read ({reason})",
+    "settings-unreadable": "the content cannot be read ({reason})",
     "settings-no-table": "the file is no table of settings",
     "batch-folder-is-capture": "the folder is a capture itself: name the folder above it, or make its head with `eigenhead reconstruct`",
     "batch-folder-empty": "the folder holds no capture: a capture is a folder with cameras.json, images/ or at least 3 photographs, or a .zip, .tar or .tar.gz of such a folder",

@@ -162,7 +162,7 @@ TEMPLATES = {
     "negate-rows": "negate the second and third row of each pose (x right, y down, z forward)",
     "held-inverse-axes-up": "world_from_camera with y up and z backwards",
     "write-inverse-negated": "write the inverse of each pose, its second and third row negated",
-    "cameras-left-out": "{cameras} {why} in {file}, so they are left out",
+    "cameras-left-out": "{cameras} {why} in {file}: left out",
     "of-other-moment": "of another moment than timestep_index {moment} (moments: {moments}; the first in timestep_indices is read)",
     "left-switched-off": "switched off ({key})",
     "left-not-aligned": "not aligned",

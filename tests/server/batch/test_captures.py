@@ -99,12 +99,12 @@ def test_every_fault_of_a_list_is_named_with_its_line(shots: Path) -> None:
     faults = faults_of(shots / "study.csv")
     for line, words in [
         (3, f"{shots / 'monday/gone'} is not there"),
-        (4, "lamp.jpg is no capture"),
-        (5, "names no capture"),
-        (6, "settings: cannot be read"),
-        (7, "no.toml: cannot be read"),
+        (4, "lamp.jpg is not a capture"),
+        (5, "the row names no capture"),
+        (6, "settings: the content cannot be read"),
+        (7, "no.toml: the content cannot be read"),
         (8, "the row has 6 cells, but the first row names 4 columns"),
-        (9, "[]: cannot be read"),
+        (9, "[]: the content cannot be read"),
     ]:
         assert [fault for fault in faults if fault.startswith(f"line {line}: ") and words in fault], (line, faults)
     assert "line 2, line 6 have the same name, monday/anna: write another one in the column name" in faults
@@ -122,8 +122,8 @@ def test_every_fault_of_a_list_is_named_with_its_line(shots: Path) -> None:
         ("capture,zzz\n.,x\n", "no column 'zzz' is known; there are capture, name, subject, session, settings"),
         ("subject,name\nx,y\n", "no column is called capture; the first row names subject, name"),
         ("capture,capture\n.,.\n", "the column capture is named twice"),
-        ("", "names no capture"),
-        ("capture\n", "names no capture"),
+        ("", "the list names no capture"),
+        ("capture\n", "the list names no capture"),
     ],
 )
 def test_a_wrong_first_row_is_named(tmp_path: Path, text: str, fault: str) -> None:

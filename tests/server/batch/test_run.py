@@ -52,7 +52,7 @@ def test_another_input_or_setting_and_a_lost_file_are_made_again_and_the_rest_is
 @pytest.mark.parametrize(
     ("mode", "kind", "words"),
     [
-        ("fail", "input", "names no capture"),
+        ("fail", "input", "the row names no capture"),
         ("bug", "bug", "ZeroDivisionError: planted"),
         ("memory", "out-of-memory", "fewer --workers"),
         ("segfault", "crash", "signal 11"),

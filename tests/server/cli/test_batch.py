@@ -60,7 +60,7 @@ def test_status_1_names_what_failed(shots: Path, tmp_path: Path) -> None:
     pinned_capture(shots / "bad", 4, "fail")
     done = invoke(shots, "--out", tmp_path / "heads", "--json")
     assert done.exit_code == 1
-    assert "eigenhead: bad: capture: names no capture; names no capture" in done.stderr.splitlines()
+    assert "eigenhead: bad: capture: the row names no capture; the list names no capture" in done.stderr.splitlines()
     assert done.stderr.splitlines()[-1] == "eigenhead: 1 capture of 4 failed: bad"
     (failure,) = json.loads(done.stdout)["failures"]
     assert (failure["capture"], failure["kind"], failure["code"]) == ("bad", "input", "input-refused")
@@ -89,7 +89,7 @@ def test_results_of_another_version_stay_and_are_told(shots: Path, tmp_path: Pat
     record.write_text(json.dumps(json.loads(record.read_text()) | {"version": "0.0.1"}))
     done = invoke(shots, "--out", tmp_path / "heads", "--json")
     assert json.loads(done.stdout)["kept"] == 3
-    assert "1 result is of another version and stays" in done.stderr
+    assert "1 result of another version was kept" in done.stderr
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

@@ -33,7 +33,7 @@ def test_a_log_has_a_line_a_capture_with_the_time_that_is_left(capsys: pytest.Ca
         assert display.seconds() >= 0
     first, second = capsys.readouterr().err.splitlines()
     assert first == "1 of 3: anna in 21 s, about 0 s left"
-    assert second == "eigenhead: bert: names no capture"
+    assert second == "eigenhead: bert: the list names no capture"
 
 
 def test_a_terminal_has_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -45,7 +45,7 @@ def test_a_terminal_has_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [column._cells for column in shown.renderables[0].columns] if hasattr(shown, "renderables") else []
     assert "3 of 3, 1 failed" in str(rows)
     assert "about 0 s left" in str(rows)
-    assert "bert: names no capture" in sys.stderr.getvalue()  # type: ignore[attr-defined]
+    assert "bert: the list names no capture" in sys.stderr.getvalue()  # type: ignore[attr-defined]
 
 
 class Clock:

@@ -96,4 +96,4 @@ def test_a_measure_comes_with_its_deviation_and_size(result: Path, tmp_path: Pat
     assert "helmet: left out, since this result has no pupil_distance" in done.output
     table.write_text(table.read_text().replace("pupil_distance", "hat"))
     refused = CliRunner().invoke(app, ["measure", str(result), "--sizes", str(table)])
-    assert "helmet: hat is no measure of a head" in str(refused.exception)
+    assert "helmet: hat is not a measurement of a head" in str(refused.exception)

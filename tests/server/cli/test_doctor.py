@@ -58,7 +58,7 @@ def test_it_names_misspelt_variables_and_a_missing_rig_file(
     assert not found["variables"]["ok"]
     assert "EIGENHEAD_KEEP_JOB is not known; did you mean EIGENHEAD_KEEP_JOBS?" in found["variables"]["detail"]
     assert not found["rig"]["ok"]
-    assert "rig.toml: cannot be read" in found["rig"]["detail"]
+    assert "rig.toml: the file cannot be read" in found["rig"]["detail"]
 
 
 def test_it_judges_the_number_of_threads(

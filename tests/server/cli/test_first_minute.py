@@ -128,7 +128,7 @@ def test_a_shell_completes_commands_options_and_what_they_may_be(line: str, offe
 def test_serve_says_in_one_line_that_its_rig_file_its_port_or_its_folder_is_no_good(run: Run, tmp_path: Path) -> None:
     done = run("serve", "--rig", tmp_path / "rig.toml")
     assert (done.status, done.err.count("\n")) == (1, 1)
-    assert "rig.toml: cannot be read (No such file or directory)" in done.err
+    assert "rig.toml: the file cannot be read (No such file or directory)" in done.err
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()

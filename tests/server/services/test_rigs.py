@@ -109,7 +109,7 @@ def test_lamps_are_set_and_kept(studio: StudioDevices, rig: RealRig, tmp_path: P
     assert brightness() < 0.5 * both
     again = RealRig(studio.folder / "rig.toml", tmp_path / "rig" / "cameras.json")
     assert again.lights() == ()
-    with pytest.raises(InputError, match="7 is no output"):
+    with pytest.raises(InputError, match="7 is not an output"):
         rig.set_lights((7,))
     rig.set_lights((0, 1))
     assert brightness() > 0.8 * both

@@ -11,10 +11,10 @@ from server.tasks.settings_file import settings_document
 @pytest.mark.parametrize(
     ("name", "text", "fault"),
     [
-        ("deep.json", "[" * 100_000, "cannot be read"),
-        ("deep.toml", "front = " + "[" * 100_000, "cannot be read"),
-        ("half.json", "{", "cannot be read"),
-        ("list.json", "[]", "is no table of settings"),
+        ("deep.json", "[" * 100_000, "the content cannot be read"),
+        ("deep.toml", "front = " + "[" * 100_000, "the content cannot be read"),
+        ("half.json", "{", "the content cannot be read"),
+        ("list.json", "[]", "the file is no table of settings"),
     ],
 )
 def test_a_file_that_holds_no_settings_is_named(tmp_path: Path, name: str, text: str, fault: str) -> None:

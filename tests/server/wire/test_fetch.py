@@ -82,7 +82,7 @@ def test_an_archive_elsewhere_becomes_a_capture(way: str, service: RunningServic
         ("{0}/to/http://127.0.0.1:1/", "url-refused", "did not allow"),
         ("{0}/to/http://169.254.169.254/latest/meta-data", "url-refused", "did not allow"),
         ("{0}/to/file:///etc/passwd", "url-refused", "no https"),
-        ("{0}/to/https://a..b/", "url-refused", "no URL"),
+        ("{0}/to/https://a..b/", "url-refused", "not a URL"),
         ("{0}/to/https://xn--/", "import-failed", "IDNA"),
         ("{0}/to/http://a:b/", "import-failed", "Invalid URL"),
         ("{0}/to/" * 7 + "{0}/a.tar", "import-failed", "redirected more than 5 times"),

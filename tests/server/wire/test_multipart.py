@@ -83,7 +83,7 @@ REFUSED: dict[str, tuple[bytes, str, int, str, str]] = {
     "a long header": (body(part("x" * 5000, b"")), TYPE, 400, "malformed-body: The body is no multipart/form-data", ""),
     "no end": (FILE, TYPE, 400, CUT, ""),
     "cut": (body(FILE)[:500], TYPE, 400, CUT, ""),
-    "no file": (body(part("label", b"")), TYPE, 422, "file-missing: The form has no part 'file' that", "file: missing"),
+    "no file": (body(part("label", b"")), TYPE, 422, "file-missing: The form has no part 'file' with", "file: missing"),
     "two": (body(TWICE), TYPE, 422, "file-repeated: The form has several parts 'file'; send one", "file: repeated"),
     "a field": (body(FILE, LONG), TYPE, 413, "field-too-large: The form field 'label' is longer than 65,536 bytes", ""),
 }

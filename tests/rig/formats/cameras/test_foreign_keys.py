@@ -164,7 +164,7 @@ def test_cameras_that_take_no_part_are_named_where_too_few_are_left() -> None:
     reading = Reading("rig.xml")
     for name in ("a", "b"):
         reading.leave_out(name, compose("left-not-aligned"))
-    with pytest.raises(InputError, match=r"a, b not aligned in rig\.xml, so they are left out"):
+    with pytest.raises(InputError, match=r"a, b not aligned in rig\.xml: left out"):
         reading.finish([])
 
 
