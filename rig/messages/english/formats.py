@@ -175,7 +175,7 @@ TEMPLATES = {
     "key-unread": "the key {key} is not read: it is misspelt or not part of this format | the key {key} of {count} cameras is not read: it is misspelt or not part of this format",
     "keys-unread-more": "{more} more keys are not read",
     "names-of-other-case": "{names} differ in capitals alone: keep one of them",
-    "cameras-of-nobody": "{files}: these camera files were not read, because no supported program writes them",
+    "cameras-of-nobody": "{files}: not read, because no supported program writes such camera files",
     "cameras-of-program": "{files}: cameras in this format are not read ({program}); docs/foreign-cameras.md lists the supported formats",
     "archives-inside": "the folder holds an archive ({archives}) and no capture: unpack it, or name the archive itself",
     "no-rig-file": "the folder contains no cameras.json (nor a file of COLMAP, caliscope, aniposelib, Metashape, RealityCapture, nerfstudio or OpenCV)",

@@ -123,7 +123,7 @@ TEMPLATES = {
     "renderer-closed": "the renderer was closed",
     "renderer-elsewhere": "the renderer was made in another thread or process",
     "no-input-silhouettes": "there are no input silhouettes; call set_inputs first",
-    "vertices-few": "there are {held} vertices, but the triangles need {wanted}",
+    "vertices-few": "there are {held}, but the triangles need {wanted}",
     "camera-without-image": "there is no {what} for camera {camera}",
     "image-shape": "{what} of camera {camera} has the shape {shape}; expected {wanted}",
     "image-beyond-driver": "camera {camera} has {width} x {height} pixels, but this OpenGL driver draws at most {most} pixels on a side",

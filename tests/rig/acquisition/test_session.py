@@ -101,7 +101,7 @@ def test_capture_overwrites_nothing_and_needs_a_calibration_of_its_size(config: 
     with pytest.raises(NoCalibration):
         capture(dataclasses.replace(config, calibration=None), tmp_path / "out")
     write_rig(flat_rig(width=640, height=480), tmp_path / "cameras.json")
-    with pytest.raises(ShotFailed, match="size: 320 x 240, calibrated 640 x 480"):
+    with pytest.raises(ShotFailed, match="size: the picture is 320 x 240, but the camera was calibrated at 640 x 480"):
         capture(dataclasses.replace(config, calibration=str(tmp_path / "cameras.json")), tmp_path / "out")
 
 

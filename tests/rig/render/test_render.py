@@ -207,7 +207,7 @@ def test_several_pages_give_the_same_costs(renderer, monkeypatch):
 
 
 def test_too_large_an_image_is_refused():
-    with pytest.raises(ImageTooLarge, match="cam00: 5000 x 400"):
+    with pytest.raises(ImageTooLarge, match="camera cam00 has 5000 x 400 pixels"):
         pack(fan(1, sizes=((5000, 400),)).cameras, 4096)
 
 

@@ -88,7 +88,7 @@ def test_realitycapture_sidecars_project_by_their_article(tmp_path: Path) -> Non
     (tmp_path / "v2.xmp").write_text(XMP.replace("brown3", "division"))
     with pytest.raises(InputError) as refused:
         read_rig_file(tmp_path / "v0.xmp")
-    assert {"v1: its picture is wanted" in fault.text for fault in refused.value.faults} == {True, False}
+    assert {"v1: the size of its picture is needed" in fault.text for fault in refused.value.faults} == {True, False}
     assert any("'division'" in fault.text for fault in refused.value.faults)
 
 

@@ -93,7 +93,7 @@ def test_slaves_of_a_rig_are_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError) as refused:
         read_cameras(metashape(tmp_path, (r'<sensor id="([1-9])"', r'<sensor id="\1" master_id="0"')))
     (fault,) = refused.value.faults
-    assert "4 cameras (cam01, cam02, cam03, cam04): sensor@master_id is '0': slave of another sensor" in fault.text
+    assert "4 cameras (cam01, cam02, cam03, cam04): sensor@master_id is '0': the sensor is a slave of" in fault.text
     read_cameras(metashape(tmp_path, (r'<sensor id="([1-9])"', r'<sensor id="\1" master_id="\1"')))  # their own
 
 

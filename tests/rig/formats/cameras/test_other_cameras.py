@@ -208,7 +208,7 @@ FAULTS: dict[str, tuple[str, str, Change, str]] = {
         "colmap-text", "images", lambda data: data.replace(b"3 cam02.png", b"77 cam02.png"), "'cam02' names camera 77"
     ),
     "a parameter is missing": (
-        "colmap-text", "cameras", lambda data: data.replace(b" 0 0 0\n", b" 0 0\n", 1), "has 11 parameters"
+        "colmap-text", "cameras", lambda data: data.replace(b" 0 0 0\n", b" 0 0\n", 1), "has 11 lens parameters"
     ),
     "too many images": (
         "colmap-text", "images", lambda data: b"\n\n".join([data.splitlines()[4]] * 1100), "images; a rig has at most"

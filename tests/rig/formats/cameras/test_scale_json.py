@@ -46,9 +46,9 @@ def test_two_points_a_tag_and_a_pair_of_cameras_are_read() -> None:
         ({"tag": "DICT_4X4_50"}, ["tag: expected an object"]),
         ({"cameras": ["cam00", "cam00"], "distance_mm": 1e9}, ["distance_mm is 1000000000.0", "two cameras"]),
         ({"cameras": ["cam00", "x"], "distance_mm": float("nan")}, ["distance_mm is nan", "'x'"]),
-        ({"tag": {"dictionary": "DICT_4X4_50", "size_mm": 4, "\ud800": 1}}, [r"key 'tag.\ud800' does not"]),
+        ({"tag": {"dictionary": "DICT_4X4_50", "size_mm": 4, "\ud800": 1}}, [r"key 'tag.\ud800' is unknown"]),
         ({"points": {"\ud800": {}, "b": {}}, "distance_mm": 4}, [r"points.\ud800: a point"]),
-        ({"cameras": ["cam00", "cam01"], "distance_cm": 41}, ["distance_mm is None", "key 'distance_cm' does not"]),
+        ({"cameras": ["cam00", "cam01"], "distance_cm": 41}, ["distance_mm is None", "key 'distance_cm' is unknown"]),
     ],
 )
 def test_every_fault_is_named(document: Any, faults: list[str]) -> None:
@@ -60,7 +60,7 @@ def test_every_fault_is_named(document: Any, faults: list[str]) -> None:
 
 def test_a_file_that_is_no_json_is_named(tmp_path: Path) -> None:
     (tmp_path / "scale.json").write_text("{")
-    with pytest.raises(InputError, match=r"scale\.json: cannot be read as JSON"):
+    with pytest.raises(InputError, match=r"scale\.json: the file cannot be read as JSON"):
         read_scale(tmp_path / "scale.json", CAMERAS)
     with pytest.raises(InputError, match="cannot be read"):
         read_scale(tmp_path / "none.json", CAMERAS)

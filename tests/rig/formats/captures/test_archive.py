@@ -406,7 +406,7 @@ def test_a_limit_is_the_most_that_passes(
 def test_the_ratio_counts_only_above_its_floor(tmp_path: Path) -> None:
     data = zip_of(("a", bytes(100_000)))
     tight = ArchiveLimits(ratio=2.0, ratio_floor_bytes=99_999)
-    assert refused(data, tmp_path, tight)[0].startswith("unpacks to more than is allowed: ")
+    assert refused(data, tmp_path, tight)[0].startswith("the archive unpacks to more than is allowed: ")
     assert unpacked(data, tmp_path, ArchiveLimits(ratio=2.0, ratio_floor_bytes=100_000)) == ("a",)
     incompressible = ArchiveLimits(ratio=1.0, ratio_floor_bytes=0)
     stored = zip_of(("b", bytes(5000)), method=zipfile.ZIP_STORED)
@@ -442,7 +442,7 @@ def test_it_unpacks_into_a_folder_that_is_there_or_is_not_yet(tmp_path: Path) ->
     with pytest.raises(InputError) as caught:
         extract_archive(tmp_path / "upload", tmp_path / "one" / "two")
     assert caught.value.subject == "two"
-    assert texts_of(caught.value.faults) == ["is not empty; an archive is unpacked into a folder of its own"]
+    assert texts_of(caught.value.faults) == ["the folder is not empty; an archive is unpacked into a folder of its own"]
 
 
 def test_a_list_of_members_has_a_limit_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -452,7 +452,7 @@ def test_a_list_of_members_has_a_limit_of_its_own(tmp_path: Path, monkeypatch: p
     assert unpacked(data, tmp_path) == ("a",)
     monkeypatch.setattr(rules, "DIRECTORY_BYTES_MOST", size - 1)
     (fault,) = refused(data, tmp_path / "more")
-    assert fault == f"has a list of members {size} bytes long: too many members"
+    assert fault == f"the archive has a list of members {size} bytes long: too many members"
 
 
 def test_a_long_name_s_header_has_a_limit_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,13 +61,13 @@ def astray(folder: Path) -> None:
         (remove("background/a.png"), "background/a.png is missing: a clean plate, or masks/a.png, is needed"),
         (
             damage("images/b.png", b"no picture"),
-            "images/b.png is damaged or no PNG, JPEG, TIFF, WebP, BMP, PPM, RAW or HEIC picture",
+            "images/b.png: the file is damaged or no PNG, JPEG, TIFF, WebP, BMP, PPM, RAW or HEIC picture",
         ),
-        (damage("images/b.png", png(picture())[:-40]), "images/b.png is damaged and cannot be decoded: send"),
+        (damage("images/b.png", png(picture())[:-40]), "images/b.png: the picture is damaged and cannot be decoded:"),
         (damage("images/b.png", png(picture()[:20])), "images/b.png is 64 x 20 pixels, but its camera is 64 x 48"),
         (damage("images/b.jpg", png(picture())), "images/ holds b.jpg, b.png: which one is meant?"),
-        (damage("background/b/001.png", b""), "background/b/001.png is damaged"),
-        (damage("masks/c.png", png(np.zeros((HEIGHT, WIDTH), np.uint8))), "masks/c.png is empty"),
+        (damage("background/b/001.png", b""), "background/b/001.png: the file is damaged"),
+        (damage("masks/c.png", png(np.zeros((HEIGHT, WIDTH), np.uint8))), "masks/c.png: the mask is empty"),
         (rename("masks/c.png", "masks/c.gif"), "masks/c.gif is not read: GIF files are not supported"),
         (astray, "images/a.png is a link to a file that is not there: /mnt/away/a.png"),
         (rename("background", "backgrounds"), "backgrounds/ is not read: call it background/"),
@@ -76,11 +76,11 @@ def astray(folder: Path) -> None:
         (remove("cameras.json"), "contains no cameras.json"),
         (rename("cameras.json", "inner.zip"), "holds an archive (inner.zip)"),
         (rename("background/a.png", "background/a.npy"), "background/a.npy is not read: NumPy files are not supported"),
-        (damage("features.json", b"{"), "features.json cannot be read as JSON"),
-        (points([]), "features.json is no object"),
-        (points({"points": {}}), "features.json: format is None"),
+        (damage("features.json", b"{"), "features.json: the file cannot be read as JSON"),
+        (points([]), "features.json: the file is no object"),
+        (points({"points": {}}), "features.json: the format is None"),
         (points({"format": FEATURES, "points": {f"p{i}": {} for i in range(201)}}), "201 points, at most 200"),
-        (feature([1, 2]), "'pronasale' is no object of camera"),
+        (feature([1, 2]), "'pronasale': the point is no object of camera"),
         (feature({"z": [1, 2]}), "names camera 'z', which the rig does not have"),
         (feature({"a": [1]}), "is no pair of finite pixels"),
         (feature({"a": [1, float("nan")]}), "is no pair of finite pixels"),
@@ -151,7 +151,7 @@ def test_a_rig_s_faults_come_with_its_file_s_name_and_captures_in_a_folder_are_n
         read_capture(folder / "absent")
     for name in ("monday", "tuesday"):
         write_capture(folder.parent / "week" / name, small_capture(), small_rig())
-    with pytest.raises(InputError, match="but monday, tuesday do: give one of these"):
+    with pytest.raises(InputError, match="but monday, tuesday do: name one of these"):
         read_capture(folder.parent / "week")
 
 
@@ -235,7 +235,7 @@ SPOILT: dict[str, tuple[Spoil, str]] = {
     ),
     "a damaged picture": (
         lambda f: (f / "texture_sets/cross/c.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(40)),
-        "texture_sets/cross/c.png is damaged",
+        "texture_sets/cross/c.png: the file is damaged",
     ),
     "a kind that is not read": (
         lambda f: (f / "texture_sets/cross/c.png").rename(f / "texture_sets/cross/c.exr"),
@@ -247,11 +247,11 @@ SPOILT: dict[str, tuple[Spoil, str]] = {
     ),
     "a name with capitals and spaces": (
         lambda f: (f / "texture_sets/cross").rename(f / "texture_sets/Cross polarised"),
-        "texture_sets/Cross polarised/ cannot name a file of the result",
+        "texture_sets/Cross polarised/ cannot be the name of a texture set",
     ),
     "a picture beside the sets": (
         lambda f: write_image(f / "texture_sets/a.png", picture()),
-        "texture_sets/a.png lies in no texture set",
+        "texture_sets/a.png belongs to no texture set",
     ),
     "nine sets": (_many, "texture_sets/ holds 9 sets; at most 8 are read"),
     "a folder almost of that name": (
@@ -346,5 +346,5 @@ def test_what_is_true_of_all_masks_is_said_once(masked: Path) -> None:
     with pytest.raises(InputError) as refused:
         read_capture(masked)
     (fault,) = refused.value.faults
-    assert fault.text.startswith("masks/a.png holds areas of 4 values")
+    assert fault.text.startswith("masks/a.png: the mask holds areas of 4 values")
     assert fault.text.endswith("the same is true of 2 more (b, c)")

@@ -153,5 +153,5 @@ def test_our_reader_gives_what_was_written_and_names_half_a_file(tmp_path: Path)
     with pytest.raises(InputError, match="bytes of vertices and faces"):
         read_head_ply(path)
     path.write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
-    with pytest.raises(InputError, match=r"no head\.ply of ours"):
+    with pytest.raises(InputError, match=r"no head\.ply written by eigenhead"):
         read_head_ply(path)

@@ -60,7 +60,7 @@ def test_every_form_of_a_mask_is_cut_at_half_of_its_own_range(pixels: np.ndarray
 
 NAMED: dict[str, tuple[np.ndarray, str]] = {
     "black": (np.zeros_like(MASK), "is empty: no pixel belongs to the subject"),
-    "white": (np.full_like(MASK, 255), "is 255 all over: it has no outline"),
+    "white": (np.full_like(MASK, 255), "the whole mask has the value 255, so it has no outline"),
     "three areas": (np.where(INSIDE, np.where(ROWS > 170, 128, 255), 0).astype(np.uint8), "holds areas of 3 values"),
     "labels": (np.where(INSIDE, 1 + ROWS // 40, 0).astype(np.uint8), "holds areas of"),
     "GrabCut's four": (np.where(INSIDE, np.where(ROWS > 130, 3, 1), np.where(COLUMNS > 260, 2, 0)).astype(np.uint8),
@@ -85,7 +85,7 @@ def test_noise_of_an_empty_mask_is_not_stretched_to_a_subject() -> None:
     noise = (NOISE[..., 0] > 200).astype(np.uint8) * 3 + (NOISE[..., 1] > 128).astype(np.uint8)
     readings = read_masks({"cam00": MASK, "cam01": noise})
     assert readings["cam00"].fault is None
-    assert str(readings["cam01"].fault).startswith("is empty")
+    assert str(readings["cam01"].fault).startswith("the mask is empty")
     assert read_masks({"cam00": MASK, "cam01": MASK // 255})["cam01"].fault is None  # 0 and 1 beside 0 and 255
 
 
@@ -94,7 +94,7 @@ def test_a_trimap_is_cut_in_the_middle_of_its_band() -> None:
     trimap = np.where(distance < -8, 255, np.where(distance > 8, 0, 128)).astype(np.uint8)
     reading = read_masks({"cam00": trimap})["cam00"]
     assert reading.soft
-    assert "undecided" in str(reading.remark)
+    assert "grey band" in str(reading.remark)
     assert np.abs(distance[(reading.share > 127) != (distance < 0)]).max(initial=0.0) < 1.0
 
 
