@@ -210,7 +210,7 @@ def test_the_world_frame_is_the_projects(calibrated: Calibration, good: Session)
     front = rig[calibrated.front]
     assert front.centre_world[2] > 0.9 * np.linalg.norm(front.centre_world)
     assert np.abs(rig.centre_world()).max() < 1e-6
-    with pytest.raises(InputError, match="'cam99' is no camera"):
+    with pytest.raises(InputError, match="'cam99' is not a camera"):
         calibrate_detections(good.detections, front="cam99")
 
 

@@ -19,7 +19,7 @@ def nested(depth: int) -> list[Any]:
 @pytest.mark.parametrize(
     ("document", "fault"),
     [
-        ({"front": "\ud800"}, r"front is '\ud800', expected a text"),
+        ({"front": "\ud800"}, r"front is '\ud800'; expected a text"),
         ({"fail_on": ["\ud800"]}, "fail_on[0] is "),
         ({"\ud800": 1}, r"unknown key '\ud800'"),
         ({"outputs": {"\ud800": 1}}, r"unknown key 'outputs.\ud800'"),

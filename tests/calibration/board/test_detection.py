@@ -112,7 +112,7 @@ def test_every_damaged_picture_is_named(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "right" / "shot1.png"), np.zeros((100, 90), np.uint8))
     with pytest.raises(InputError) as error:
         detect_folder(tmp_path, CHARUCO)
-    assert any("left/shot1.png is no picture" in fault.text for fault in error.value.faults)
+    assert any("left/shot1.png: the file is not a picture" in fault.text for fault in error.value.faults)
     assert any("right/shot1.png is 90 x 100" in fault.text for fault in error.value.faults)
 
 

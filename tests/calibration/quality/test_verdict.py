@@ -21,7 +21,7 @@ HELD_OUT = Check("held-out shots", True, verbatim(""))
         ({"focal_share": 0.05}, "poor", "cam02: the focal length is uncertain by more than 3 %"),
         ({"pose_sigma_px": 0.7}, "usable", "cam02: the pose is uncertain by more than 0.5 px"),
         ({"pose_sigma_px": float("inf")}, "poor", "cam02: the pose is uncertain by more than 1.0 px"),
-        ({"covered": 0.2}, "usable", "cam02: the board was never near the rim"),
+        ({"covered": 0.2}, "usable", "cam02: the board was never near the border"),
     ],
 )
 def test_the_weakest_camera_decides(weak: dict[str, float], word: str, reason: str | None) -> None:

@@ -55,7 +55,7 @@ def test_views_that_do_not_join_are_named(tmp_path: Path) -> None:
     assert document["scale"]["assumed"]
     assert any("ASSUMPTION" in warning for warning in document["warnings"])
     assert list(found.left_out) == ["dark"]
-    assert "only 0 distinct points" in found.left_out["dark"].text
+    assert "the view has only 0 distinct points" in found.left_out["dark"].text
     assert any(warning.text.startswith("left out: dark") for warning in found.warnings)
     with pytest.raises(CalibrationRefused, match="the front camera dark: only 0"):
         calibrate_scene(photos, front="dark")
@@ -67,7 +67,7 @@ def test_faults_of_the_photographs_are_named(tmp_path: Path) -> None:
         calibrate_scene(photos, front="cam9")
     (photos / "cam00.png").write_bytes(b"no picture")
     write_image(photos / "cam01.png", np.zeros((50, 60), np.uint8))
-    with pytest.raises(InputError, match=r"cam00\.png is damaged"):
+    with pytest.raises(InputError, match=r"cam00\.png: the file is damaged"):
         calibrate_scene(photos)
     write_image(photos / "cam00.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     with pytest.raises(InputError, match="2 sizes"):

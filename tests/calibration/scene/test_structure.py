@@ -36,7 +36,7 @@ def test_observed_pixels_have_their_origin_in_a_pixels_centre() -> None:
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("dark", "only 12 distinct points in it"),
+        ("dark", "the view has only 12 distinct points"),
         ("alone", "none of the view's 900 points is found in another view"),
         ("far", "the view has at most 20 points in common with another view (near)"),
         ("farther", "the view has at most 30 points in common with another view (far, which did not join either)"),

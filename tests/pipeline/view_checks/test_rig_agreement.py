@@ -92,7 +92,7 @@ def test_rotations_that_are_transposed_are_named_where_the_cameras_look_at_the_o
     assert rig_faults(written) == []
     found = wrong_rig(of_all, written)
     assert found is not None
-    assert "hold the rotation transposed" in found.text
+    assert "contains the rotation transposed" in found.text
     assert "transpose each rotation" in found.text
 
 

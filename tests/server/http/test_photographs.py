@@ -43,7 +43,7 @@ def test_the_cameras_of_photographs_are_found_and_what_was_assumed_is_told(http:
     assert {"cameras.json", "calibration.json", "masks/cam00.png"} <= capture["inputs"].keys()
     assert not [name for name in capture["inputs"] if "dark" in name]
     assert [warning["code"] for warning in capture["warnings"]] == ["view-left-out", "scale-assumed", "face-nowhere"]
-    assert "dark: only 0 distinct points" in capture["warnings"][0]["message"]
+    assert "dark: the view has only 0 distinct points" in capture["warnings"][0]["message"]
     assert "ASSUMPTION" in capture["warnings"][1]["message"]
     assert http.get(f"/v1/captures/{capture['id']}").json()["warnings"] == capture["warnings"]
     assert await_state(http, http.post("/v1/jobs", json={"capture_id": capture["id"]}).json()["id"], ("succeeded",))

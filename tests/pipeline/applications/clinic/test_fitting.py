@@ -157,7 +157,7 @@ def test_a_file_is_read(tmp_path: Path) -> None:
     ('measure = "head_circumference"', "", "measure is missing, wrong or unknown"),
     ("allowance", "alowance", "alowance is missing, wrong or unknown"),
     ("sizes", "size", "sizes is missing, wrong or unknown"),
-    ("name =", "name", r"no TOML file of sizes .*: write lines such as format = .*, \[\[table\]\], name = "),
+    ("name =", "name", r"not a TOML file of sizes .*: write lines such as format = .*, \[\[table\]\], name = "),
 ])  # fmt: skip
 def test_a_wrong_table_is_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
     path = tmp_path / "sizes.toml"

@@ -100,7 +100,7 @@ def test_another_surface_is_refused() -> None:
     surface = PatientSurface(Reference.of(mesh, {}, "b.stl"), "LPS", True)
     upright = frankfurt_axes(HEAD.measured, "LPS").patient_from_world
     names = ("pronasale", "tragion_left", "tragion_right")
-    with pytest.raises(InputError, match=r"b\.stl: does not have the face of anna"):
+    with pytest.raises(InputError, match=r"b\.stl: the surface does not have the face of anna"):
         register(HEAD, surface, {name: upright.apply(HEAD.measured.landmarks[name]) for name in names})
 
 

@@ -160,7 +160,7 @@ def test_a_header_is_read_without_the_mesh_and_damage_is_told(tmp_path: Path) ->
     np.savez(path, other=np.zeros(3))
     with pytest.raises(BadTemplate, match="does not carry"):
         read_header(path)
-    with pytest.raises(BadTemplate, match="format 'eigenhead-template/9'"):
+    with pytest.raises(BadTemplate, match="format is 'eigenhead-template/9'"):
         read_header(header_file(tmp_path, "flame", format="eigenhead-template/9"))
     with pytest.raises(BadTemplate, match="No such file"):
         read_header(tmp_path / "none.npz")

@@ -101,7 +101,7 @@ def test_limits_are_read_and_wrong_ones_named() -> None:
     with pytest.raises(InputError) as error:
         read_table(Limits, {"face_rms": 1.0, "least_covered": "much"}, "limits.toml")
     assert "limits.toml: unknown key 'face_rms'; did you mean 'face_rms_mm'?" in str(error.value)
-    assert "least_covered is 'much', expected a finite number" in str(error.value)
+    assert "least_covered is 'much'; expected a finite number" in str(error.value)
 
 
 def test_the_most_and_the_least() -> None:
