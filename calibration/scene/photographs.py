@@ -44,10 +44,7 @@ class Photographs:
 
 def find_photographs(folder: Path) -> Photographs:
     """Lists the photographs in ``folder`` by camera and shot. Raises an InputError that names every fault."""
-    if not folder.is_dir():
-        raise InputError(folder.name, [compose("no-folder-of-photographs")])
-    root = capture_root(folder)
-    root = picture_folder(root)
+    root = picture_folder(capture_root(folder))
     flat = listed_pictures(root)
     beside = [path for path in sorted(root.iterdir()) if path.is_dir() and path.name.lower() not in ASIDE]
     folders = {safe_name(path.name): listed_pictures(path) for path in beside}

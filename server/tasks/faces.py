@@ -15,9 +15,7 @@ from pipeline.faces.networks import load_networks
 from pipeline.faces.sighting import file_pixels, reduce_picture
 from pipeline.faces.subject import find_subject
 from rig.camera import Camera
-from rig.errors import InputError
-from rig.formats.cameras.cameras_file import NO_RIG, find_rig_file, read_rig_file
-from rig.formats.captures.capture_folder import has_known_length
+from rig.formats.captures.capture_folder import has_known_length, open_capture
 from rig.formats.pictures.images import read_image
 from rig.progress import Progress
 from rig.rig import Rig
@@ -39,10 +37,8 @@ def find_capture_faces(
     """Finds the faces in a capture's pictures, and which of them is the subject's. ``images``: file of each camera's
     picture, below the folder ``capture``. Raises InputError, and DamagedNetwork if a network's file is damaged."""
     root = Path(capture)
-    rig_file = find_rig_file(root)
-    if rig_file is None:
-        raise InputError("capture", [NO_RIG])
-    recorded = read_rig_file(rig_file)
+    _, read, _, _ = open_capture(root)
+    recorded = read.rig
     pictures, cameras = {}, []
     for number, camera in enumerate(camera for camera in recorded if camera.name in images):
         report("read", number / len(images))

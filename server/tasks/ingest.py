@@ -27,7 +27,7 @@ from rig.camera import Camera
 from rig.capture import TEXTURE_SETS, Capture
 from rig.errors import EigenheadError, InputError
 from rig.files import sha256_of
-from rig.formats.cameras.cameras_file import NO_RIG, find_rig_file, read_cameras, rig_file_parts
+from rig.formats.cameras.cameras_file import NO_RIG, rig_file_parts
 from rig.formats.cameras.cameras_json import read_rig
 from rig.formats.cameras.scale_json import read_scale
 from rig.formats.captures.archive import ArchiveLimits, extract_archive
@@ -357,13 +357,11 @@ def _read_view(
 def check_features(context: WorkerContext, report: Progress, *, folder: str, points: Points) -> bytes:
     """Checks feature points (pixels, by point and camera) against the cameras of the capture in ``folder``. Returns the
     bytes of the features.json that holds them. Raises InputError naming every wrong point."""
-    rig_file = find_rig_file(Path(folder))
-    if rig_file is None:
-        raise InputError("capture", [NO_RIG])
+    _, read, _, _ = open_capture(Path(folder))
     data = json.dumps({"format": FEATURES_FORMAT, "points": points}, indent=1).encode()
     # Points come one after the other: whether they suffice is asked when the job starts.
     of_file: list[Message] = []
-    unknown = unknown_landmarks(features_from_bytes(data, read_cameras(rig_file).rig, of_file))
+    unknown = unknown_landmarks(features_from_bytes(data, read.rig, of_file))
     if of_file or unknown:
         raise InputError("features.json", [*of_file, *unknown])
     return data

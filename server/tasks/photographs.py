@@ -20,7 +20,7 @@ from rig.camera import Intrinsics
 from rig.capture import Capture, ReadImage
 from rig.errors import InputError
 from rig.files import sha256_of, write_atomically
-from rig.formats.cameras.cameras_file import find_rig_file, read_rig_file
+from rig.formats.cameras.cameras_file import find_rig_file, misplaced_fault, read_rig_file
 from rig.formats.cameras.cameras_json import CAMERAS_MOST, read_rig, write_rig
 from rig.formats.cameras.scale_json import read_scale
 from rig.formats.captures.capture_folder import (
@@ -56,13 +56,12 @@ class Prepared:
 
 
 def photographs_alone(folder: Path) -> bool:
-    """Returns whether a folder has photographs but no cameras, so that these must be estimated."""
+    """Returns whether a folder has photographs of a head but no cameras, so that these must be estimated."""
     root = capture_root(folder)
-    if find_rig_file(root) is not None:
+    if find_rig_file(root) is not None or misplaced_fault(root) is not None:
         return False
-    pictures = picture_folder(root)
-    found = (path for depth in ("*", "*/*") for path in pictures.glob(depth))  # as find_photographs looks for them
-    return any(is_picture(path) for path in found)
+    found = (path for depth in ("*", "*/*") for path in picture_folder(root).glob(depth))  # as find_photographs looks
+    return any(map(is_picture, found))
 
 
 def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Progress) -> Prepared:

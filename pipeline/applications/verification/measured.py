@@ -93,7 +93,7 @@ def read_report(folder: Path) -> ReportDocument:
     """Returns the decoded report.json of a result without checking its contents. Raises InputError."""
     try:
         return json.loads((folder / "report.json").read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(f"{folder.name}/report.json", [compose("report-missing")]) from error
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise InputError(f"{folder}/report.json", [compose("report-missing")]) from error
     except (OSError, ValueError) as error:
         raise InputError(f"{folder.name}/report.json", [f"cannot be read ({error})"]) from error

@@ -94,14 +94,23 @@ def _are_of_splatting(entries: list[Any]) -> bool:
 def no_rig_fault(folder: Path) -> Message:
     """Returns a fault that reports a folder without a file of cameras. The returned fault names any captures, archives,
     or files of unsupported programs in the folder."""
-    if unread := unread_programs(folder):
-        return unread[0]
+    if elsewhere := misplaced_fault(folder) or next(iter(unread_programs(folder)), None):
+        return elsewhere
     archives = [path.name for path in sorted(folder.iterdir()) if path.name.lower().endswith(ARCHIVE_ENDINGS)]
     if archives:
         return compose("archives-inside", archives=some_of(archives))
     inner = sorted(path for path in folder.iterdir() if path.is_dir() and not is_junk(path.name))
     captures = [path.name for path in inner if path.suffix != ".truth" and find_rig_file(path)]
     return compose("captures-inside", captures=some_of(captures)) if len(captures) > 1 else NO_RIG
+
+
+def misplaced_fault(folder: Path) -> Message | None:
+    """Returns the fault of pictures that are no capture: those of a calibration board, or a capture's images/ alone."""
+    if entry(folder, "board.toml").is_file():
+        return compose("board-pictures")
+    name, above = folder.absolute().name, folder.absolute().parent
+    is_part = name.lower() == "images" and find_rig_file(above) is not None
+    return compose("capture-above", folder=above.name) if is_part else None
 
 
 def find_rig_file(folder: Path) -> Path | None:

@@ -86,7 +86,6 @@ TEMPLATES = {
     "held-out-missing": "there are too few shots for a held-out test: take 15 in all",
     "photographs-of-sizes": "the photographs have {sizes} sizes, but they must all have the same size",
     "photograph-size-differs": "{camera}/{shot} is {width} x {height} pixels, but the other shots of its camera are {wanted}",
-    "no-folder-of-photographs": "the path is no folder; name the folder with the photographs",
     "is-a-result": "the folder is the result of a job: name the capture from which it was made",
     "photographs-beside-folders": "the folder holds photographs beside folders of photographs: use one picture for each camera, or one folder for each camera",
     "photograph-repeated": "{folder} holds {name} {count} times, with different endings",

@@ -167,9 +167,7 @@ def test_a_capture_of_too_few_good_pictures_is_refused(tmp_path: Path) -> None:
 def test_a_key_that_nobody_reads_is_a_warning(masked: Shot, tmp_path: Path) -> None:
     write_capture(tmp_path / "shot", *masked)
     path = tmp_path / "shot" / "cameras.json"
-    document = json.loads(path.read_text())
-    document["units"] = "m"
-    path.write_text(json.dumps(document))
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"units": "m"}))
     found = found_in(tmp_path / "shot")
     assert [warning["code"] for warning in found["warnings"]] == ["unknown-key"]
     assert re.search("warning  unknown-key: the .*: cameras.json: the key 'units' is not read", " ".join(lines(found)))
@@ -211,10 +209,15 @@ def test_damaged_photographs_without_cameras_are_all_named(tmp_path: Path) -> No
     folder = photographs(tmp_path / "photos")
     assert not found_in(folder)["faults"]
     (folder / "images" / "cam00.png").write_bytes(b"")
-    whole = (folder / "images" / "cam02.png").read_bytes()
-    (folder / "images" / "cam02.png").write_bytes(whole[: len(whole) // 2])
+    HARMS["is damaged and cannot be decoded: send it again"](folder / "images" / "cam02.png")
     faults = found_in(folder)["faults"]
     assert [fault.split()[0] for fault in faults] == ["images/cam00.png:", "images/cam02.png:"]
+
+
+def test_pictures_that_are_no_capture_say_what_to_do_with_them(tmp_path: Path) -> None:
+    (photographs(tmp_path / "boards") / "board.toml").touch()
+    assert "use eigenhead calibrate" in found_in(tmp_path / "boards")["faults"][0]
+    assert "part of the capture anna" in found_in(small_capture(tmp_path / "anna") / "images")["faults"][0]
 
 
 @pytest.mark.parametrize("kind", [small_capture, photographs])

@@ -55,12 +55,12 @@ def test_a_hospital_s_file_has_a_pseudonym_of_letters_and_digits(result: Path, t
     assert "not one of 'LPS', 'RAS'" in done.output
 
 
-def test_a_folder_that_is_no_result_is_refused(tmp_path: Path) -> None:
-    exports = [["export", str(tmp_path), "--as", form] for form in ("slicer", "obj")]
+def test_a_folder_that_is_no_result_is_refused(result: Path, tmp_path: Path) -> None:
+    exports = [["export", str(tmp_path), "--as", "slicer"], ["export", str(result / "head.ply"), "--as", "obj"]]
     for words in (*exports, ["compare", str(tmp_path), str(tmp_path)]):
         done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")])
         assert done.exit_code == 1
-        assert "report.json: the file is not there: name the folder of a result" in str(done.exception)
+        assert f"{words[1]}/report.json: the file is not there: name the folder of a result" in str(done.exception)
         assert not [*(tmp_path / "out").glob("*")]
 
 
