@@ -184,9 +184,9 @@ def test_unread_cameras_are_warnings_and_a_scale_is_read(masked: Shot, tmp_path:
     (folder / "images" / "cam00.xmp").write_text(
         '<x:xmpmeta xmlns:x="adobe:ns:meta/"></x:xmpmeta>'
     )  # a raw developer's
-    warnings = [(w["code"], re.split("(?<! than is read): ", w["message"])[0]) for w in found_in(folder)["warnings"]]
+    warnings = [(w["code"], re.split("(?<! no effect): ", w["message"])[0]) for w in found_in(folder)["warnings"]]
     names = ("sparse/0/cameras.bin", "transforms.json")
-    unread = [("file-unread", f"the folder holds more than is read: {name} is not read") for name in names]
+    unread = [("file-unread", f"a part of the folder has no effect: {name} is not read") for name in names]
     assert sorted(warnings) == sorted([*unread, ("cameras-scaled", "the cameras were scaled by 0.94")])
     (folder / "calibration.json").write_text("{}")  # which says that the scale was read, and found these cameras
     assert len(found_in(folder)["warnings"]) == 2
