@@ -178,5 +178,5 @@ def test_an_upload_is_told_what_check_tells(tmp_path: Path) -> None:
     content, kept = kept_of(folder, tmp_path)
     said = {warning.code: warning.text for warning in content.warnings}
     assert said["pose-doubtful"].partition(": ")[2] in checked_by_command(folder, {}, report=lambda *_: None)["faults"]
-    assert {"images/foo.png", "depth/"} <= {w.text.split()[7] for w in content.warnings if w.code == "file-unread"}
+    assert {"images/foo.png", "depth/"} <= {w.text.split()[8] for w in content.warnings if w.code == "file-unread"}
     assert not (kept / "images" / "foo.png").exists()
