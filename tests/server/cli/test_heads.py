@@ -1,6 +1,7 @@
 """What the commands that make heads say beside their answer."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -68,11 +69,11 @@ def test_a_format_that_does_not_exist_is_wrong_usage_and_the_others_reach_the_se
 def test_a_result_never_lies_among_the_pictures_of_its_capture(inside: str, enclosed: bool, tmp_path: Path) -> None:
     capture = tmp_path / "capture"
     folder = small_capture(capture / "anna" if enclosed else capture)
+    photographs = Path(shutil.copytree(folder / "images", tmp_path / "photographs"))  # a capture without cameras.json
     before = sorted(tmp_path.rglob("*"))
     for out in [folder / inside, *([capture / "head"] if enclosed else [])]:
         with pytest.raises(SpoilsCapture, match="name another place with --out"):
             reconstruct_local.reconstruct_locally(capture, out, model=None, settings={}, report=discard_progress)
-    photographs = folder / "images"  # of one camera, as a capture without names of cameras has them
     within = photographs / "out"
     with pytest.raises(SpoilsCapture):
         reconstruct_local.reconstruct_locally(photographs, within, model=None, settings={}, report=discard_progress)
