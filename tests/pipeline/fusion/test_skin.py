@@ -73,7 +73,6 @@ def test_a_crater_and_a_speck_go_to_the_head(height_mm: float) -> None:
 
 
 def test_a_pit_of_chance_matches_goes_to_the_head() -> None:
-    """Several views agree on a false place, next to which the head states a millimetre."""
     head = ellipsoid(6)
     pit = np.linalg.norm(head.vertices - head.vertices[0], axis=1) < 5.0
     assert combined(head, -6.0 * pit, depth_mm=0.3, stated_mm=1.0).min() > -1.0
