@@ -58,6 +58,12 @@ def rest_surface(vertices: Vertices, faces: Int[np.ndarray, "f 3"]) -> RestSurfa
     return RestSurface(vertices, faces, beside, excluded)
 
 
+def crossings(rest: RestSurface, displacement: Vertices, weights: tuple[float, ...] = WEIGHTS) -> Int[np.ndarray, " w"]:
+    """Returns, for each weight of a blendshape, the number of triangles that cross others only in the posed mesh."""
+    moved = _moved(rest, displacement)
+    return np.array([np.count_nonzero(_crossing(rest, displacement, w, moved)) for w in weights])
+
+
 def kept_apart(rest: RestSurface, displacement: Vertices, *, closing: bool) -> Vertices:
     """Returns a blendshape's displacement (mm, at weight 1) with the smallest change that leaves as few new crossings
     of triangles at ``WEIGHTS`` as possible. If ``closing``, the blendshape closes the lids, which stop where they meet;
