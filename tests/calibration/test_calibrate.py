@@ -112,7 +112,7 @@ REFUSED = {
         CalibrationRefused,
         "cam02 contradicts the other cameras in",
     ),
-    "one camera alone": (one_camera_alone, CalibrationRefused, "cam02 is the only camera, and a rig has several"),
+    "one camera alone": (one_camera_alone, CalibrationRefused, "cam02 is the only camera, but a rig has several"),
     "blind camera": (one_camera_is_blind, CalibrationRefused, "cam04 never sees the board"),
     "two groups": (two_rigs, PoseGraphError, "shares no shot with the others"),
 }

@@ -57,7 +57,7 @@ def test_views_that_do_not_join_are_named(tmp_path: Path) -> None:
     assert list(found.left_out) == ["dark"]
     assert "the view has only 0 distinct points" in found.left_out["dark"].text
     assert any(warning.text.startswith("left out: dark") for warning in found.warnings)
-    with pytest.raises(CalibrationRefused, match="the front camera dark: only 0"):
+    with pytest.raises(CalibrationRefused, match="the front camera dark: the view has only 0"):
         calibrate_scene(photos, front="dark")
 
 

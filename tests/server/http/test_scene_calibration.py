@@ -68,6 +68,6 @@ def test_shots_of_the_rig_become_one_or_are_refused_with_the_views(
     assert made.status_code == 202, made.text
     found = await_calibration(http, made.json()["id"])
     assert (found["state"], found["source"], found["kind"]) == ("failed", "rig", "scene")
-    assert any(error.startswith("cam00: only") for error in found["error"]["errors"])
+    assert any(error.startswith("cam00: the view has only") for error in found["error"]["errors"])
     assert not (service.data / "calibrations" / found["id"] / "images").exists()
     assert http.get(f"/v1/captures/{capture}/images/cam00").status_code == 200
