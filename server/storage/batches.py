@@ -162,8 +162,8 @@ class BatchIndex:
         Locks the batch's row until the end of the caller's transaction, so that no other process assigns jobs to these
         items or changes the batch's ``wish``.
         """
-        runs = sa.select(batches.c.id).where(batches.c.id == identity, batches.c.wish == "running")
-        if connection.scalar(runs.with_for_update()) is None:
+        those = sa.update(batches).where(batches.c.id == identity, batches.c.wish == "running")
+        if not connection.execute(those.values(wish="running")).rowcount:  # SQLite locks with the first change alone
             return []
         item = batch_items.c
         query = sa.select(item.position, item.capture_id, item.job_id).where(item.batch_id == identity)
