@@ -137,9 +137,7 @@ def _adjust(graph: Graph, detections: Detections, lenses: dict[str, Lens], repor
     names, noise = graph.names, np.array([lenses[name].noise_px for name in graph.names])
     weak = weak_prior([detections.sizes[name] for name in names])
     dropped = list(_explain(graph.strays, graph, graph.state(lenses), detections, float(np.median(noise))))
-    gone = {(d.shot, d.camera) for d in dropped}
-    views = tuple(v for v in (*graph.views, *graph.strays) if not {(v.shot, v.camera), (v.shot, None)} & gone)
-    views = tuple(v for v in views if v in graph.views)
+    views = _exclude(graph.views, dropped)
     state = graph.state(lenses)
 
     def tick() -> None:
@@ -159,9 +157,14 @@ def _adjust(graph: Graph, detections: Detections, lenses: dict[str, Lens], repor
         strange = [view for view, is_bad in zip(views, bad, strict=True) if is_bad]
         explanations = list(_explain(strange, graph, state, detections, float(np.median(sigma))))
         dropped += explanations
-        gone = {(d.shot, d.camera) for d in explanations}
-        views = tuple(v for v in views if not {(v.shot, v.camera), (v.shot, None)} & gone)
+        views = _exclude(views, explanations)
     return _finish(state, views, graph, detections, lenses, weak, noise=noise, dropped=tuple(dropped), report=report)
+
+
+def _exclude(views: Iterable[View], dropped: Iterable[Dropped]) -> tuple[View, ...]:
+    """Returns the views that were not dropped. What was dropped without a camera is a whole shot."""
+    gone = {(d.shot, d.camera) for d in dropped}
+    return tuple(v for v in views if not {(v.shot, v.camera), (v.shot, None)} & gone)
 
 
 def _finish(
