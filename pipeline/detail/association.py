@@ -1,4 +1,5 @@
-"""Assigns each measured surface point to the closest point of the head with a similar normal.
+"""Assigns each measured surface point to the closest point of the head with a similar normal, and makes observations
+of the head from these pairs.
 
 The search for pairs goes from the measured points to the head. With this direction, parts of the head without measured
 points, and the borders of such holes, get no observation.
@@ -7,16 +8,25 @@ points, and the borders of such holes, get no observation.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.threads import in_threads
+from pipeline.detail.dense_points import SurfacePoints
+from pipeline.detail.patch_points import PatchPlaces
+from pipeline.detail.solve import Observed
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.surface_index import corners_at_vertices
 from pipeline.geometry.surface_kernels import FannedMesh, closest_at_vertices
+from pipeline.part_labels.codes import Part
+from rig.mesh import vertex_normals
 
+Vertices = Float[np.ndarray, "v 3"]
+PerVertex = Float[np.ndarray, " v"]
 Faces = Int[np.ndarray, "f 3"]
 
 CANDIDATES = 4  # vertices whose triangles are tried
+CORRELATION_MM = 4.0  # radius within which points err alike: windows of dense matching overlap
+PATCH_REACH_MM = 4.0  # no dense point counts so near to a patch, whose window reaches as far
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,3 +93,114 @@ def interpolated(corners: Float[np.ndarray, "n 3 3"], blend: Float[np.ndarray, "
     """Interpolates values at n points inside triangles from the three corners, with barycentric coordinates
     ``blend``."""
     return np.einsum("nk,nkc->nc", blend, corners)
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """Holds the limits of one round of the deformation, which assigns the points to the head and solves for the
+    displacement. ``agreement`` is the smallest cosine between a point's normal and the head's."""
+
+    reach_mm: float
+    loose_reach_mm: float
+    agreement: float
+    robust_mm: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointObservations:
+    """Holds the observations of the head from surface points. The class also holds, for the n points of skin, the
+    triangle on the head (corners and barycentric coordinates) and the standard deviation."""
+
+    observed: Observed
+    corner: Int[np.ndarray, "n 3"]
+    blend: Float[np.ndarray, "n 3"]
+    deviation_mm: Float[np.ndarray, " n"]
+
+
+def observe(
+    base: Vertices,
+    current: Vertices,
+    faces: Faces,
+    surface: SurfacePoints,
+    loose: Bool[np.ndarray, " v"],
+    *,
+    limits: Round,
+    floor_mm: float,
+) -> PointObservations:
+    """Returns the observations from points near the head ``current``, as offsets (mm) from ``base``. A point of hair
+    counts only where the head extends beyond the point.
+
+    The normal of an observation is the mean of the point's and the head's normal (Rusinkiewicz 2019, *A symmetric
+    objective function for ICP*), which is exact to second order for curved surfaces.
+    """
+    normals = vertex_normals(current, faces)
+    found = Target.of(current, normals, faces).closest(
+        surface.points, surface.normals, reach_mm=limits.loose_reach_mm, least_agreement=limits.agreement
+    )
+    corner = faces[found.triangle]
+    reach = np.where(loose[corner].any(axis=1), limits.loose_reach_mm, limits.reach_mm)
+    between = interpolated(normals[corner], found.blend) + surface.normals[found.row]
+    between /= np.maximum(np.linalg.norm(between, axis=1, keepdims=True), 1e-9)
+    point = surface.points[found.row]
+    off = ((point - interpolated(current[corner], found.blend)) * between).sum(axis=1)
+    skin = surface.part[found.row] == Part.SKIN
+    informative = np.where(skin, found.distance_mm <= reach, off < 0.0)  # hair counts where the head reaches beyond it
+    variance = surface.deviation_mm[found.row] ** 2 + floor_mm**2
+    robust = np.where(skin, 1.0 / (1.0 + (off / limits.robust_mm) ** 2) ** 2, 1.0)
+    shared = _local_density(found, corner, current, faces)
+    offset = ((point - interpolated(base[corner], found.blend)) * between).sum(axis=1)
+    retained, of_skin = np.flatnonzero(informative), np.flatnonzero(informative & skin)
+    information = robust / (variance * shared)
+    return PointObservations(
+        Observed(corner[retained], found.blend[retained], between[retained], offset[retained], information[retained]),
+        corner[of_skin],
+        found.blend[of_skin],
+        surface.deviation_mm[found.row[of_skin]],
+    )
+
+
+def with_patches(
+    observed: Observed, found: PatchPlaces, base: Vertices, current: Vertices, faces: Faces, robust_mm: float
+) -> Observed:
+    """Adds the patches' measurements on the head ``current``, and drops the observations from dense matching within
+    ``PATCH_REACH_MM`` of a patch."""
+    vertex, normals = found.vertex, vertex_normals(current, faces)[found.vertex]
+    if not len(vertex):
+        return observed
+    place = current[vertex] + found.place_mm[:, None] * normals
+    offset = ((place - base[vertex]) * normals).sum(axis=1)
+    information = found.information / (1.0 + (found.place_mm / robust_mm) ** 2) ** 2
+    at = interpolated(base[observed.corner], observed.blend)
+    alone = nearest(PointTree.of(base[vertex]), at, within=PATCH_REACH_MM)[0] > PATCH_REACH_MM
+    corner, blend = np.repeat(vertex[:, None], 3, axis=1), np.tile([1.0, 0.0, 0.0], (len(vertex), 1))
+    return observed.chosen(alone).joined(Observed(corner, blend, normals, offset, information))
+
+
+def typical_deviation(dense: PointObservations, faces: Faces, count: int) -> PerVertex:
+    """Returns the mean standard deviation (mm) of the points of skin around each of ``count`` vertices; 0 without
+    points."""
+    if not len(dense.corner):
+        return np.zeros(count)
+    known = np.bincount(dense.corner.ravel(), dense.blend.ravel(), count)
+    total = np.bincount(dense.corner.ravel(), (dense.blend * dense.deviation_mm[:, None]).ravel(), count)
+    return _pooled(total, faces) / np.maximum(_pooled(known, faces), 1e-9)
+
+
+def _pooled(values: PerVertex, faces: Faces) -> PerVertex:
+    """Returns twice the sum of the values over the triangles around each vertex."""
+    for _ in range(2):
+        values = np.bincount(faces.ravel(), np.repeat(values[faces].sum(axis=1), 3), len(values))
+    return values
+
+
+def _local_density(
+    found: Associated, corner: Int[np.ndarray, "n 3"], vertices: Vertices, faces: Faces
+) -> Float[np.ndarray, " n"]:
+    """Returns, for each point, the number of points within ``CORRELATION_MM``, which have the same error. The number
+    follows from the points' density on the surface."""
+    area = np.linalg.norm(np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]],
+                                   vertices[faces[:, 2]] - vertices[faces[:, 0]]), axis=1) / 6.0  # fmt: skip
+    mass = np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
+    count = np.bincount(corner.ravel(), found.blend.ravel(), len(vertices)).astype(float)  # of nothing it is integers
+    density = (_pooled(count, faces) / np.maximum(_pooled(mass, faces), 1e-9))[corner].mean(axis=1)
+    return np.maximum(1.0, density * np.pi * CORRELATION_MM**2)

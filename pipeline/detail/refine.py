@@ -15,11 +15,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.sparse as sparse
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from pipeline.compute.trace import traced
 from pipeline.contour_fit.fit import Fit
-from pipeline.detail.association import Associated, Target, interpolated
+from pipeline.detail.association import Faces, PerVertex, Round, Vertices, observe, typical_deviation, with_patches
 from pipeline.detail.blink import blink_shift, estimate_eyelid_closure, plain_shape
 from pipeline.detail.dense_points import CELL_MM, SurfacePoints, thinned
 from pipeline.detail.ears import with_ears_in_place
@@ -49,50 +49,21 @@ MAX_TURN = 0.0  # cosine between a triangle before and after; a right angle is a
 MIN_AREA = 0.02  # of the triangle's own, before
 SWEEPS, RINGS = 60, 6  # of smoothing, and how far about a fold it may reach
 GIVING_WAY = 0.8  # what a sweep leaves of a displacement, in the second half of them
-Vertices = Float[np.ndarray, "v 3"]
-PerVertex = Float[np.ndarray, " v"]
-Faces = Int[np.ndarray, "f 3"]
-
 COARSE_LENGTH_MM = 12.0  # over which a displacement of the nodes fades where nothing is seen
 LENGTH_MM = 5.0  # the same of the displacement along the normals that follows it
 MIN_AMPLITUDE_MM = 0.7  # standard deviation of a displacement where the fit claims to be better
 COARSE_CELL_MM = 2.5  # the same for the nodes, whose edges are 4 mm long
 FLOOR_MM = 0.05  # error of a point that its deviation does not show
 COARSE_FLOOR_MM = 0.3  # the same for the nodes: relief that edges of 4 mm cannot follow
-CORRELATION_MM = 4.0  # radius within which points err alike: windows of dense matching overlap
-COMMON_MM = 0.1  # error beyond that radius that all points share: cameras, shading
+COMMON_MM = 0.1  # error that all points share, however far apart: cameras, shading
 SHARED_ERROR = 0.25  # share of a point's deviation that points beyond it share: means over 16 mm are 0.2 to 1 of it off
 MIN_OBSERVED_SHARE = 0.2  # of the face's vertices that the dense surface must show, or it is of no use
 DRAWS = 24  # of the posterior: its deviation is known to a seventh
 SEED = 16
 
-
-@dataclass(frozen=True, slots=True)
-class Round:
-    """Holds the limits of one round of the deformation, which assigns the points to the head and solves for the
-    displacement. ``agreement`` is the smallest cosine between a point's normal and the head's."""
-
-    reach_mm: float
-    loose_reach_mm: float
-    agreement: float
-    robust_mm: float
-
-
 COARSE = (Round(5.0, 10.0, 0.5, 3.0), Round(4.0, 7.0, 0.6, 2.0), Round(3.0, 5.0, 0.7, 1.0))
 FINE = Round(2.0, 2.5, 0.7, 0.5)
-LOOKS_MM = (1.0, 0.5)  # robust scale of each look at the photographs, on the head that the last one left
-PATCH_REACH_MM = 4.0  # no dense point counts so near to a patch, whose window reaches as far
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PointObservations:
-    """Holds the observations of the head from surface points. The class also holds, for the n points of skin, the
-    triangle on the head (corners and barycentric coordinates) and the standard deviation."""
-
-    observed: Observed
-    corner: Int[np.ndarray, "n 3"]
-    blend: Float[np.ndarray, "n 3"]
-    deviation_mm: Float[np.ndarray, " n"]
+PATCH_ROUNDS_MM = (1.0, 0.5)  # robust scale of each round that measures the current head by the photographs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,7 +127,7 @@ def refine_to_surface(
         solving_nodes(model),
         surface,
         loose=regions["ears"] | regions["neck"],
-        look=patches and patches.places,
+        measure_patches=patches and patches.places,
         outlines=outlines and outlines.observed,
         report=report,
     )
@@ -173,7 +144,7 @@ def deform_to_points(
     surface: SurfacePoints,
     *,
     loose: Bool[np.ndarray, " v"],
-    look: Callable[[Vertices], PatchPlaces] | None = None,
+    measure_patches: Callable[[Vertices], PatchPlaces] | None = None,
     outlines: Outlines | None = None,
     shared_error: float = SHARED_ERROR,
     report: Progress = discard_progress,
@@ -187,7 +158,7 @@ def deform_to_points(
         nodes: the meshes on which the displacement is solved.
         surface: the points, in the same frame.
         loose: vertices that may move farther than the others.
-        look: measures the surface once more with the photographs; None skips this step.
+        measure_patches: measures the surface once more with the photographs; None skips this step.
         outlines: compares the surface with silhouettes; None skips this step.
         shared_error: the fraction of the points' standard deviation that is an error common to all of them.
         report: called with the share that is done.
@@ -210,10 +181,8 @@ def deform_to_points(
     dense = observe(base, current, faces, fine_points, loose, limits=FINE, floor_mm=FLOOR_MM)
     posterior = solve_field(field, directions, with_outlines(dense.observed, outlines, base, current, FINE.robust_mm))
     current = base + directions.moved(posterior.mean)
-    for robust_mm in LOOKS_MM:
-        if look is None:
-            break
-        combined = with_patches(dense.observed, look(current), base, current, faces, robust_mm)
+    for robust_mm in PATCH_ROUNDS_MM if measure_patches is not None else ():
+        combined = with_patches(dense.observed, measure_patches(current), base, current, faces, robust_mm)
         posterior = solve_field(field, directions, with_outlines(combined, outlines, base, current, robust_mm))
         current = base + directions.moved(posterior.mean)
     seen = np.zeros(len(vertices), bool)
@@ -251,95 +220,6 @@ def with_outlines(
 ) -> Observed:
     """Adds the observations from the outlines, if there are any, to the observations from points."""
     return observed if outlines is None else observed.joined(outlines(base, current, robust_mm))
-
-
-def observe(
-    base: Vertices,
-    current: Vertices,
-    faces: Faces,
-    surface: SurfacePoints,
-    loose: Bool[np.ndarray, " v"],
-    *,
-    limits: Round,
-    floor_mm: float,
-) -> PointObservations:
-    """Returns the observations from points near the head ``current``, as offsets (mm) from ``base``. A point of hair
-    counts only where the head extends beyond the point.
-
-    The normal of an observation is the mean of the point's and the head's normal (Rusinkiewicz 2019, *A symmetric
-    objective function for ICP*), which is exact to second order for curved surfaces.
-    """
-    normals = vertex_normals(current, faces)
-    found = Target.of(current, normals, faces).closest(
-        surface.points, surface.normals, reach_mm=limits.loose_reach_mm, least_agreement=limits.agreement
-    )
-    corner = faces[found.triangle]
-    reach = np.where(loose[corner].any(axis=1), limits.loose_reach_mm, limits.reach_mm)
-    between = interpolated(normals[corner], found.blend) + surface.normals[found.row]
-    between /= np.maximum(np.linalg.norm(between, axis=1, keepdims=True), 1e-9)
-    point = surface.points[found.row]
-    off = ((point - interpolated(current[corner], found.blend)) * between).sum(axis=1)
-    skin = surface.part[found.row] == Part.SKIN
-    informative = np.where(skin, found.distance_mm <= reach, off < 0.0)  # hair counts where the head reaches beyond it
-    variance = surface.deviation_mm[found.row] ** 2 + floor_mm**2
-    robust = np.where(skin, 1.0 / (1.0 + (off / limits.robust_mm) ** 2) ** 2, 1.0)
-    shared = _local_density(found, corner, current, faces, CORRELATION_MM)
-    offset = ((point - interpolated(base[corner], found.blend)) * between).sum(axis=1)
-    retained, of_skin = np.flatnonzero(informative), np.flatnonzero(informative & skin)
-    information = robust / (variance * shared)
-    return PointObservations(
-        Observed(corner[retained], found.blend[retained], between[retained], offset[retained], information[retained]),
-        corner[of_skin],
-        found.blend[of_skin],
-        surface.deviation_mm[found.row[of_skin]],
-    )
-
-
-def with_patches(
-    observed: Observed, found: PatchPlaces, base: Vertices, current: Vertices, faces: Faces, robust_mm: float
-) -> Observed:
-    """Adds the patches' measurements on the head ``current``, and drops the observations from dense matching within
-    ``PATCH_REACH_MM`` of a patch."""
-    vertex, normals = found.vertex, vertex_normals(current, faces)[found.vertex]
-    if not len(vertex):
-        return observed
-    place = current[vertex] + found.place_mm[:, None] * normals
-    offset = ((place - base[vertex]) * normals).sum(axis=1)
-    information = found.information / (1.0 + (found.place_mm / robust_mm) ** 2) ** 2
-    at = interpolated(base[observed.corner], observed.blend)
-    alone = nearest(PointTree.of(base[vertex]), at, within=PATCH_REACH_MM)[0] > PATCH_REACH_MM
-    corner, blend = np.repeat(vertex[:, None], 3, axis=1), np.tile([1.0, 0.0, 0.0], (len(vertex), 1))
-    return observed.chosen(alone).joined(Observed(corner, blend, normals, offset, information))
-
-
-def typical_deviation(dense: PointObservations, faces: Faces, count: int) -> PerVertex:
-    """Returns the mean standard deviation (mm) of the points of skin around each of ``count`` vertices; 0 without
-    points."""
-    if not len(dense.corner):
-        return np.zeros(count)
-    known = np.bincount(dense.corner.ravel(), dense.blend.ravel(), count)
-    total = np.bincount(dense.corner.ravel(), (dense.blend * dense.deviation_mm[:, None]).ravel(), count)
-    return _pooled(total, faces) / np.maximum(_pooled(known, faces), 1e-9)
-
-
-def _pooled(values: PerVertex, faces: Faces) -> PerVertex:
-    """Returns twice the sum of the values over the triangles around each vertex."""
-    for _ in range(2):
-        values = np.bincount(faces.ravel(), np.repeat(values[faces].sum(axis=1), 3), len(values))
-    return values
-
-
-def _local_density(
-    found: Associated, corner: Int[np.ndarray, "n 3"], vertices: Vertices, faces: Faces, correlation_mm: float
-) -> Float[np.ndarray, " n"]:
-    """Returns, for each point, the number of points within ``correlation_mm``, which have the same error. The number of
-    points follows from the density of points."""
-    area = np.linalg.norm(np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]],
-                                   vertices[faces[:, 2]] - vertices[faces[:, 0]]), axis=1) / 6.0  # fmt: skip
-    mass = np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
-    count = np.bincount(corner.ravel(), found.blend.ravel(), len(vertices)).astype(float)  # of nothing it is integers
-    density = (_pooled(count, faces) / np.maximum(_pooled(mass, faces), 1e-9))[corner].mean(axis=1)
-    return np.maximum(1.0, density * np.pi * correlation_mm**2)
 
 
 def field_deviation(
@@ -396,7 +276,7 @@ def unfolded(before: Vertices, after: Vertices, faces: Faces) -> Vertices:
 
 
 def _around(chosen: Int[np.ndarray, "b 3"], faces: Faces, count: int, rings: int) -> Int[np.ndarray, "g 3"]:
-    """Returns a mask of the faces within ``rings`` rings around the chosen faces."""
+    """Returns the faces within ``rings`` rings around the chosen faces, with these."""
     about = np.zeros(count, bool)
     about[chosen] = True
     for _ in range(rings - 1):
