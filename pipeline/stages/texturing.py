@@ -23,7 +23,6 @@ from pipeline.texturing.paint import find_layout, paint_head
 from pipeline.texturing.pores.skin_maps import COARSER, CloseViews, SkinMaps, read_close_views, skin_maps, skin_share
 from pipeline.texturing.sets.texture_sets import SetTextures, colour_by_sets
 from pipeline.texturing.vertex_colours import Shown, Texture, texture
-from pipeline.warnings import ReportWarning
 from rig.capture import Capture
 from rig.mesh import Mesh
 from rig.messages.message import compose
@@ -51,9 +50,9 @@ def texture_head(
     """Colours the final head from the photographs, and paints its textures and maps."""
     settings, rig, model, mesh = context.settings, context.rig, head.model, refined.mesh_world
     normals, depths, face = mesh.normals(), depth_maps(rig, mesh), model.levels["full"].face_region
-    layout, layout_warnings = find_layout(model, settings)
-    chart, chart_warnings = chart_colours(views.capture, rig) if settings.texture.chart else (None, [])
+    chart, warnings = chart_colours(views.capture, rig) if settings.texture.chart else (None, [])
     capture = views.capture if chart is None else with_true_colours(views.capture, chart)
+    layout, of_layout = find_layout(model, settings)
     around = None if layout is None else layout.around
     vertices = texture(
         mesh,
@@ -72,7 +71,8 @@ def texture_head(
             compared=halves_of_face(model),
         ),
     )
-    close, pores_warnings = _read_pores(context, views, mesh, vertices, face, chart)
+    warnings += (*vertices.warnings, *of_layout)
+    close = _read_pores(context, views, mesh, vertices, face, chart)
     atlas = paint_head(layout, mesh, vertices, face, settings, None if close is None else close.views.scaled(COARSER))
     skin = None
     if close is not None and layout is not None and atlas is not None:
@@ -88,14 +88,17 @@ def texture_head(
             world_from_head=head.fit.world_from_head,
         )
     reduced = reduced_layout(model, layout.layout) if layout is not None and settings.outputs.normal_map else None
-    albedo, albedo_warnings = None, []
+    albedo = None
     if settings.outputs.albedo != "none":
-        albedo, albedo_warnings = estimate_albedo(mesh, normals, vertices, atlas, face, around, chart=chart)
-    sets, set_warnings = colour_by_sets(
+        albedo, of_albedo = estimate_albedo(mesh, normals, vertices, atlas, face, around, chart=chart)
+        warnings += of_albedo
+    if settings.detail == "pores" and close is None:
+        warnings += [compose("no-pores")]
+    sets, of_sets = colour_by_sets(
         capture.texture_sets, vertices.decision, mesh, views.silhouettes, layout, atlas=atlas, settings=settings.texture
     )
-    warnings = (*chart_warnings, *vertices.warnings, *layout_warnings, *albedo_warnings, *pores_warnings, *set_warnings)
-    return Staged(Texturing(normals, depths, capture, vertices, atlas, reduced, chart, albedo, skin, sets), warnings)
+    made = Texturing(normals, depths, capture, vertices, atlas, reduced, chart, albedo, skin, sets)
+    return Staged(made, [*warnings, *of_sets])
 
 
 def _read_pores(
@@ -105,12 +108,9 @@ def _read_pores(
     coloured: Texture,
     face: Bool[np.ndarray, " v"],
     chart: ChartColours | None,
-) -> tuple[CloseViews | None, list[ReportWarning]]:
-    """Reads the full-size pictures for the detail ``pores``. Returns None for other levels of detail, or with a warning
-    if files are missing."""
-    if context.settings.detail != "pores":
-        return None, []
-    if context.read_original is None or coloured.decision is None:
-        return None, [compose("no-pores")]
-    close = read_close_views(context.read_original, mesh, coloured, face, sources=views.assignment, chart=chart)
-    return close, []
+) -> CloseViews | None:
+    """Reads the full-size pictures for the detail ``pores``. Returns None for other levels of detail, if files are
+    missing, and if the head has no texture."""
+    if context.settings.detail != "pores" or context.read_original is None or coloured.decision is None:
+        return None
+    return read_close_views(context.read_original, mesh, coloured, face, sources=views.assignment, chart=chart)
