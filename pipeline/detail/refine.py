@@ -181,7 +181,9 @@ def deform_to_points(
     dense = observe(base, current, faces, fine_points, loose, limits=FINE, floor_mm=FLOOR_MM)
     posterior = solve_field(field, directions, with_outlines(dense.observed, outlines, base, current, FINE.robust_mm))
     current = base + directions.moved(posterior.mean)
-    for robust_mm in PATCH_ROUNDS_MM if measure_patches is not None else ():
+    for robust_mm in PATCH_ROUNDS_MM:
+        if measure_patches is None:
+            break
         combined = with_patches(dense.observed, measure_patches(current), base, current, faces, robust_mm)
         posterior = solve_field(field, directions, with_outlines(combined, outlines, base, current, robust_mm))
         current = base + directions.moved(posterior.mean)
