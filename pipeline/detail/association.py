@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.threads import in_threads
 from pipeline.detail.dense_points import SurfacePoints
-from pipeline.detail.patch_points import PatchPlaces
+from pipeline.detail.patch_points import PatchMeasurements
 from pipeline.detail.solve import Observed
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.surface_index import corners_at_vertices
@@ -160,16 +160,16 @@ def observe(
 
 
 def with_patches(
-    observed: Observed, found: PatchPlaces, base: Vertices, current: Vertices, faces: Faces, robust_mm: float
+    observed: Observed, found: PatchMeasurements, base: Vertices, current: Vertices, faces: Faces, robust_mm: float
 ) -> Observed:
     """Adds the patches' measurements on the head ``current``, and drops the observations from dense matching within
     ``PATCH_REACH_MM`` of a patch."""
     vertex, normals = found.vertex, vertex_normals(current, faces)[found.vertex]
     if not len(vertex):
         return observed
-    place = current[vertex] + found.place_mm[:, None] * normals
-    offset = ((place - base[vertex]) * normals).sum(axis=1)
-    information = found.information / (1.0 + (found.place_mm / robust_mm) ** 2) ** 2
+    measured = current[vertex] + found.distance_mm[:, None] * normals
+    offset = ((measured - base[vertex]) * normals).sum(axis=1)
+    information = found.information / (1.0 + (found.distance_mm / robust_mm) ** 2) ** 2
     at = interpolated(base[observed.corner], observed.blend)
     alone = nearest(PointTree.of(base[vertex]), at, within=PATCH_REACH_MM)[0] > PATCH_REACH_MM
     corner, blend = np.repeat(vertex[:, None], 3, axis=1), np.tile([1.0, 0.0, 0.0], (len(vertex), 1))

@@ -38,13 +38,13 @@ class OutlineSearch:
     views: Views
     hair: HairProbability
 
-    def observed(self, base: Float[np.ndarray, "v 3"], now: Float[np.ndarray, "v 3"], robust_mm: float) -> Observed:
+    def observe(self, base: Float[np.ndarray, "v 3"], current: Float[np.ndarray, "v 3"], robust_mm: float) -> Observed:
         """Returns the offsets (mm) of the silhouettes from the vertices ``base`` along the normals at the rim. The rim
-        is found on the head ``now``; all positions are in the world frame."""
-        rim = find_rim(self.topology, now, self.views, averaged=True)
+        is found on the head ``current``; all positions are in the world frame."""
+        rim = find_rim(self.topology, current, self.views, averaged=True)
         px_per_mm = np.linalg.norm(rim.gradient, axis=1)
         normal, off = rim.gradient / px_per_mm[:, None], -rim.residual / px_per_mm
-        moved = (now - base)[rim.corner]
+        moved = (current - base)[rim.corner]
         moved = (1.0 - rim.blend)[:, None] * moved[:, 0] + rim.blend[:, None] * moved[:, 1]
         scale = max(robust_mm, MIN_ROBUST_MM) * np.where(off < 0.0, OUTSIDE_SCALE, 1.0)
         robust = (1.0 - self._hair_at(rim)) / (1.0 + (off / scale) ** 2) ** 2

@@ -31,11 +31,11 @@ SEARCH = Round(window_mm=1.2, blur_mm=0.3, reach_mm=0.8, steps=9)  # 1.6 and 2 m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PatchPlaces:
+class PatchMeasurements:
     """Holds n vertices of the full mesh, and the measured distance of the surface along their normals."""
 
     vertex: Int[np.ndarray, " n"]
-    place_mm: Float[np.ndarray, " n"]
+    distance_mm: Float[np.ndarray, " n"]
     information: Float[np.ndarray, " n"]  # mm^-2, overlap of the patches taken off
 
 
@@ -51,7 +51,7 @@ class PatchSearch:
     cameras: tuple[Camera, ...]
     hair: HairProbability
 
-    def places(self, vertices: Float[np.ndarray, "v 3"]) -> PatchPlaces:
+    def measure(self, vertices: Float[np.ndarray, "v 3"]) -> PatchMeasurements:
         """Measures the surface in the photographs near a head (world frame, mm). Patches without a clear match in
         several views, and those under hair, are left out."""
         level, coarse = self.model.levels["full"], self.model.levels[DEPTH_LEVEL]
@@ -65,7 +65,7 @@ class PatchSearch:
         kept = np.flatnonzero(found.several & found.clear & ~hidden)
         overlap = max(1.0, 4.0 * np.pi * SEARCH.window_mm**2 / CENTRE_MM**2)
         information = 1.0 / (overlap * found.variance[kept])
-        return PatchPlaces(self.patches.centre[kept], found.place[kept], information)
+        return PatchMeasurements(self.patches.centre[kept], found.place[kept], information)
 
 
 def patch_search(

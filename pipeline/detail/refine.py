@@ -25,7 +25,7 @@ from pipeline.detail.dense_points import CELL_MM, SurfacePoints, thinned
 from pipeline.detail.ears import with_ears_in_place
 from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids, with_plain_lids
 from pipeline.detail.outline_points import Outlines, OutlineSearch
-from pipeline.detail.patch_points import PatchPlaces, PatchSearch
+from pipeline.detail.patch_points import PatchMeasurements, PatchSearch
 from pipeline.detail.smooth_field import smooth_field
 from pipeline.detail.solve import (
     NodeMesh,
@@ -115,7 +115,7 @@ def refine_to_surface(
     lids, unexplained = estimate_eyelid_closure(fit, model, base, surface, eyes or {})
     closed = frozenset(side for side, eye in (eyes or {}).items() if eye.closed and lids.get(side, 1.0) == 1.0)
     blink = blink_shift(fit, model, lids)
-    base = unfolded(shape + blink, base + blink, faces)
+    base = unfold(shape + blink, base + blink, faces)
     base = bridge_eyelids(base, model, closed.difference(lids) | unexplained)
     surface = thinned(surface, CELL_MM)  # a million points of depth maps, a fiftieth of that in cells
     base = with_ears_in_place(base, model, thinned(surface, COARSE_CELL_MM))
@@ -127,8 +127,8 @@ def refine_to_surface(
         solving_nodes(model),
         surface,
         loose=regions["ears"] | regions["neck"],
-        measure_patches=patches and patches.places,
-        outlines=outlines and outlines.observed,
+        measure_patches=patches and patches.measure,
+        outlines=outlines and outlines.observe,
         report=report,
     )
     clean, clean_deviation_mm = untangled_head(model, head.vertices, head.deviation_mm)
@@ -144,7 +144,7 @@ def deform_to_points(
     surface: SurfacePoints,
     *,
     loose: Bool[np.ndarray, " v"],
-    measure_patches: Callable[[Vertices], PatchPlaces] | None = None,
+    measure_patches: Callable[[Vertices], PatchMeasurements] | None = None,
     outlines: Outlines | None = None,
     shared_error: float = SHARED_ERROR,
     report: Progress = discard_progress,
@@ -173,7 +173,7 @@ def deform_to_points(
     current = _coarsely_deformed(
         vertices, amplitude, faces, nodes.coarse, coarse_points, loose=loose, outlines=outlines, report=report
     )
-    base = current = unfolded(vertices, current, faces)
+    base = current = unfold(vertices, current, faces)
     normals = vertex_normals(base, faces)
     field = smooth_field(nodes.fine.shape @ base, nodes.fine.faces, LENGTH_MM)
     directions = normal_directions(nodes.fine, nodes.fine.shape @ amplitude, normals)
@@ -191,7 +191,7 @@ def deform_to_points(
     seen[dense.corner] = True
     common_mm = np.hypot(COMMON_MM, shared_error * typical_deviation(dense, faces, len(vertices)))
     deviation = field_deviation(posterior, base, normals, amplitude, seen, common_mm=common_mm)
-    return DeformedSurface(unfolded(base, current, faces), deviation, seen)
+    return DeformedSurface(unfold(base, current, faces), deviation, seen)
 
 
 def _coarsely_deformed(
@@ -247,17 +247,17 @@ def field_deviation(
     return np.sqrt(near * square + (1.0 - near) * np.maximum(square, deviation_mm**2))
 
 
-def folded(before: Vertices, after: Vertices, faces: Faces) -> Bool[np.ndarray, " f"]:
+def is_folded(before: Vertices, after: Vertices, faces: Faces) -> Bool[np.ndarray, " f"]:
     """Returns a mask of the triangles that a displacement flips or makes almost degenerate."""
     old, new = face_normals(before, faces), face_normals(after, faces)
     size, length = np.linalg.norm(old, axis=1), np.linalg.norm(new, axis=1)
     return ((old * new).sum(axis=1) <= MAX_TURN * size * length) | (length < MIN_AREA * size)
 
 
-def unfolded(before: Vertices, after: Vertices, faces: Faces) -> Vertices:
+def unfold(before: Vertices, after: Vertices, faces: Faces) -> Vertices:
     """Removes folds from the displaced vertices ``after``. Around each fold the displacement from ``before`` is
     smoothed until no triangle is flipped. In the second half of the sweeps the displacement is also reduced."""
-    bad = faces[folded(before, after, faces)]
+    bad = faces[is_folded(before, after, faces)]
     if not len(bad):
         return after
     local = _around(bad, faces, len(before), RINGS)
@@ -269,7 +269,7 @@ def unfolded(before: Vertices, after: Vertices, faces: Faces) -> Vertices:
     for sweep in range(SWEEPS):
         give = np.unique(_around(bad, local, len(rows), 1))
         moved[give] = (1.0 if sweep < SWEEPS // 2 else GIVING_WAY) * (mean[give] @ moved)
-        bad = local[folded(old, old + moved, local)]
+        bad = local[is_folded(old, old + moved, local)]
         if not len(bad):
             break
     out = after.copy()

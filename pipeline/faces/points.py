@@ -51,13 +51,9 @@ def point_table() -> PointTable:
 
 def view_terms(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 8"]:
     """Returns the eight polynomial terms, up to third order, of which the network's bias is a weighted sum.
-    ``direction`` is the unit vector from the face to the camera (face frame). ``VIEW_TERMS_MIRRORED`` are the factors
-    that give the terms of the mirror image."""
+    ``direction`` is the unit vector from the face to the camera (face frame)."""
     x, y, _ = direction
     return np.array([1.0, x, y, x * x, x * y, y * y, x**3, x * x * y])
-
-
-VIEW_TERMS_MIRRORED = np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
 
 
 def view_bias(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "468 2"]:

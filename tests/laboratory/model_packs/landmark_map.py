@@ -25,14 +25,7 @@ from pipeline.applications.model_building.sources.imports import import_model
 from pipeline.faces.detection import FaceDetection
 from pipeline.faces.landmark_map import faces_digest
 from pipeline.faces.networks import PACKS, FaceNetworks, load_networks
-from pipeline.faces.points import (
-    VIEW_TERMS_MIRRORED,
-    PointTable,
-    direction_from_face,
-    place_face,
-    point_table,
-    view_terms,
-)
+from pipeline.faces.points import PointTable, direction_from_face, place_face, point_table, view_terms
 from pipeline.faces.triangulated_face import triangulate_face, unbiased_px
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel, assemble, load_model
@@ -168,7 +161,7 @@ def _fitted_bias(measured: Sequence[Measured], maps: Maps) -> Float[np.ndarray, 
         for mirrored in (False, True):
             towards = direction * MIRROR if mirrored else direction
             miss_seen = miss[table.mirror_images] * (-1.0, 1.0) if mirrored else miss
-            terms = view_terms(direction) * (VIEW_TERMS_MIRRORED if mirrored else 1.0)
+            terms = view_terms(direction) * (view_terms(MIRROR) if mirrored else 1.0)
             weight = np.exp(-2.0 * table.point_noise[1] * (1.0 - table.normals @ towards))
             matrix += weight[:, None, None] * np.outer(terms, terms)
             right += weight[:, None, None] * terms[:, None] * miss_seen[:, None, :]

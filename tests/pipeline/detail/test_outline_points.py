@@ -68,6 +68,6 @@ def test_outlines_of_skin_hold_a_tip_that_all_windows_put_too_deep(hair: float |
 def test_offsets_lead_from_the_base_to_the_outline() -> None:
     vertices, _, _ = subdivided_sphere()
     now = vertices * (81.0 / RADIUS_MM)
-    observed = search().observed(vertices, now, 3.0)
+    observed = search().observe(vertices, now, 3.0)
     assert len(observed.offset_mm) > 500
     np.testing.assert_allclose(observed.offset_mm, TRUE_MM - RADIUS_MM, atol=0.05)  # chords of 5 mm sag by 0.04 mm

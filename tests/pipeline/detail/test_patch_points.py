@@ -26,13 +26,13 @@ def search(scene: Scene, hair: float = 0.0) -> PatchSearch:
 @pytest.mark.parametrize("off_mm", [0.0, 0.4])
 def test_patches_say_how_far_the_head_is_off(scene: Scene, off_mm: float) -> None:
     faces = scene.model.levels["full"].faces
-    found = search(scene).places(scene.truth + off_mm * vertex_normals(scene.truth, faces))
+    found = search(scene).measure(scene.truth + off_mm * vertex_normals(scene.truth, faces))
     # Matched to 0.1 px, 0.9 mm each, between views 25 degrees apart, five of them: 0.1 mm a patch.
     assert len(found.vertex) > 200
-    assert np.median(found.place_mm) == pytest.approx(-off_mm, abs=0.06)
-    assert np.median(np.abs(found.place_mm + off_mm)) < 0.15
+    assert np.median(found.distance_mm) == pytest.approx(-off_mm, abs=0.06)
+    assert np.median(np.abs(found.distance_mm + off_mm)) < 0.15
     assert (found.information > 0).all()
 
 
 def test_patches_of_hair_say_nothing(scene: Scene) -> None:
-    assert not len(search(scene, hair=1.0).places(scene.truth).vertex)
+    assert not len(search(scene, hair=1.0).measure(scene.truth).vertex)

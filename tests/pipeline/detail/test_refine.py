@@ -9,7 +9,7 @@ from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.posterior import vertex_deviation_mm
 from pipeline.detail.dense_points import SurfacePoints
 from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids
-from pipeline.detail.refine import SHARED_ERROR, DeformedSurface, deform_to_points, folded, refine_to_surface, unfolded
+from pipeline.detail.refine import SHARED_ERROR, DeformedSurface, deform_to_points, is_folded, refine_to_surface, unfold
 from pipeline.fusion.untangling import head_topology, spoilt_faces
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
@@ -40,7 +40,7 @@ def test_a_sphere_becomes_the_ellipsoid_that_the_points_show() -> None:
     # Half a point a mm^2: within a correlated length of the field (5 mm) some 40 points, 0.2 / sqrt(40) = 0.03 mm, and
     # chords of 5 mm sag by 0.04 mm.
     assert np.sqrt((off**2).mean()) < 0.07
-    assert not folded(vertices, found.vertices, faces).any()
+    assert not is_folded(vertices, found.vertices, faces).any()
     held = np.abs(off) < 1.96 * found.deviation_mm
     assert 0.93 <= held.mean() <= 1.0
     slid = found.vertices - vertices
@@ -132,7 +132,7 @@ def test_a_planted_head_is_found_within_its_intervals(model: HeadModel) -> None:
     face = model.levels["full"].face_region & found.observed
     assert np.median(after[face]) < 0.1 < 0.3 < np.median(before[face])
     assert np.median(after[head_regions(model)["ears"] & found.observed]) < 0.5
-    assert not folded(start, found.vertices, faces).mean() > 2e-3
+    assert not is_folded(start, found.vertices, faces).mean() > 2e-3
     assert not spoilt_faces(found.vertices, head_topology(model)).any()
     assert found.closed_eyes == frozenset()
 
@@ -150,7 +150,7 @@ def test_closed_lids_bridge_the_opening(model: HeadModel) -> None:
     eyes = head_regions(model)["eyes"]
     off = np.abs(((found.vertices - truth) * vertex_normals(truth, faces)).sum(axis=1))[eyes]
     assert off.mean() < 0.15
-    assert not folded(truth, found.vertices, faces)[eyes[faces].all(axis=1)].any()
+    assert not is_folded(truth, found.vertices, faces)[eyes[faces].all(axis=1)].any()
     assert not spoilt_faces(found.vertices, head_topology(model)).any()
 
 
@@ -165,11 +165,11 @@ def test_a_planted_fold_gives_way_and_what_is_smooth_stays() -> None:
     vertices, faces, _ = subdivided_sphere()
     moved = vertices.copy()
     moved[500] += 3.0 * (vertices[faces[(faces == 500).any(axis=1)][0]].mean(axis=0) - vertices[500])
-    assert folded(vertices, moved, faces).any()
-    mended = unfolded(vertices, moved, faces)
-    assert not folded(vertices, mended, faces).any()
+    assert is_folded(vertices, moved, faces).any()
+    mended = unfold(vertices, moved, faces)
+    assert not is_folded(vertices, mended, faces).any()
     far = np.linalg.norm(vertices - vertices[500], axis=1) > 50.0
     np.testing.assert_array_equal(mended[far], moved[far])
     moved = vertices * (1.0 + 0.02 * np.sin(vertices[:, :1] / 20.0))
-    assert not folded(vertices, moved, faces).any()
-    assert unfolded(vertices, moved, faces) is moved
+    assert not is_folded(vertices, moved, faces).any()
+    assert unfold(vertices, moved, faces) is moved
