@@ -37,7 +37,7 @@ def report_page(calibration: Calibration) -> str:
         f"<style>{STYLE}</style><h1>Camera calibration</h1><p>{summary}</p>",
         "<h2>Checks</h2>",
         _checks(calibration),
-        listed("Warnings", calibration.warnings),
+        write_list("Warnings", calibration.warnings),
         "<h2>Cameras</h2>",
         _camera_table(calibration),
         _offsets(calibration),
@@ -62,7 +62,7 @@ def _checks(calibration: Calibration) -> str:
     return f"<table class='wide'>{''.join(rows)}</table>"
 
 
-def listed(title: str, lines: Iterable[Message | str]) -> str:
+def write_list(title: str, lines: Iterable[Message | str]) -> str:
     """Returns an HTML list with a heading, or an empty text without lines."""
     items = "".join(f"<li>{escape(str(line))}</li>" for line in lines)
     return f"<h2>{title}</h2><ul>{items}</ul>" if items else ""

@@ -9,10 +9,10 @@ from tests.tools.counts import count_all, list_single_importers, list_solver_loo
 CEILINGS = Path(__file__).with_name("ceilings.toml")
 CLASS_LINES = 270
 SOLVER_LOOPS = {
-    "pipeline.faces.irises.fitted": "its edges are searched anew at each reach: no two steps have a cost in common",
+    "pipeline.faces.irises.fit_limbus": "its edges are searched anew at each reach: no two steps have a cost in common",
     "pipeline.multiview.triangulation.triangulate_many": "takes the steps of thousands of points at once",
     "pipeline.texturing.light.fit_light": "its bounds are inequalities over a sphere, which each step states anew",
-    "rig.studio.scene.subject.scattered": "solves once for each colour, and no least squares",
+    "rig.studio.scene.subject.scatter_light": "solves once for each colour, and no least squares",
 }  # why the rooms of least squares do not serve
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from calibration.adjustment.state import rms
 from calibration.quality.checks import POSE_GOOD_PX, POSE_POOR_PX, Verdict
-from calibration.report import STYLE, listed, table
+from calibration.report import STYLE, table, write_list
 from calibration.scene.covariance import Uncertainty
 from calibration.scene.scale import Scale
 from calibration.scene.structure import Structure
@@ -138,8 +138,8 @@ def scene_page(calibration: SceneCalibration) -> str:
         [
             "<!doctype html><html lang='en'><meta charset='utf-8'><title>Calibration from the scene</title>",
             f"<style>{STYLE}</style><h1>Calibration from the scene</h1><p>{summary}</p><p>{scale_line}</p>{refined}",
-            listed("Views that did not join", calibration.absences()),
-            listed("Warnings", calibration.warnings),
+            write_list("Views that did not join", calibration.absences()),
+            write_list("Warnings", calibration.warnings),
             "<h2>Cameras</h2>",
             table(head, rows),
             "</html>",

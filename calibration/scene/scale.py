@@ -229,7 +229,7 @@ def _median_radius(points: Float[np.ndarray, "p 3"]) -> float:
     return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 
 
-def scaled_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) -> tuple[Rig, list[Message]]:
+def scale_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) -> tuple[Rig, list[Message]]:
     """Scales a rig so that a known length is correct (mm). Returns the scaled rig and a message about the change. If
     the rig agrees with the length within its uncertainty, returns the unchanged rig and no message.
 

@@ -112,7 +112,7 @@ def calibrate_scene(
     scale_result = find_scale(structure, known, photographs, head)
     calibration = placed(structure, scale_result, matches, left_out, front)
     report("silhouettes", 0.0)
-    calibration = refined_by_masks(calibration, find_masks(folder, photographs, calibration.rig))
+    calibration = refine_by_masks(calibration, find_masks(folder, photographs, calibration.rig))
     first = {name: next(iter(photographs.files[name].values())) for name in calibration.rig.names}
     return replace(calibration, rig=with_serials(calibration.rig, first))
 
@@ -137,8 +137,8 @@ def placed(
     CalibrationRefused if the structure lacks the camera ``front``."""
     if front in left_out:
         raise CalibrationRefused([compose("front-left-out", camera=str(front), why=left_out[str(front)])])
-    here = transformed(structure, structure.rig, scale.factor)
-    here = transformed(here, in_guessed_frame(here.rig, front), 1.0)
+    here = transform_structure(structure, structure.rig, scale.factor)
+    here = transform_structure(here, in_guessed_frame(here.rig, front), 1.0)
     spread = uncertainty(here)
     cameras = (replace(camera, covariance=block) for camera, block in zip(here.rig, spread.blocks, strict=True))
     reasons = (compose("located", where=name, fault=why) for name, why in left_out.items())
@@ -167,7 +167,7 @@ def placed(
     )
 
 
-def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.ndarray, "_ _"]]) -> SceneCalibration:
+def refine_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.ndarray, "_ _"]]) -> SceneCalibration:
     """Refines the camera poses by the subject's silhouettes. The refined poses are accepted if held-out pairs of views
     agree better. Returns the unchanged calibration if there are too few masks."""
     rig = calibration.rig
@@ -180,7 +180,7 @@ def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.
     return calibration if done is None else replace(calibration, rig=done[0], refinement=done[1])
 
 
-def transformed(structure: Structure, moved: Rig, factor: float) -> Structure:
+def transform_structure(structure: Structure, moved: Rig, factor: float) -> Structure:
     """Multiplies the structure's lengths by ``factor`` and transforms it to the frame in which its cameras have the
     poses of ``moved``."""
     before, after = structure.rig.cameras[0].camera_from_world, moved.cameras[0].camera_from_world

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from calibration.report import STYLE, listed, table
+from calibration.report import STYLE, table, write_list
 from calibration.silhouette_refinement.refine import Refinement, robust_rms
 from rig.formats.cameras.cameras_json import document_from_rig
 from rig.geometry import vector_from_rotation
@@ -76,7 +76,7 @@ def refinement_page(run: RefinementRun) -> str:
         f"<p>The change is <b class='{kind}'>{verdict}</b>: {escape(refinement.reason.text)}.</p>",
         f"<p>Captures: {escape(', '.join(run.captures))}. Each was judged with the cameras where the others alone put "
         "them.</p>",
-        listed("Warnings", run.warnings),
+        write_list("Warnings", run.warnings),
         "<h2>Cameras</h2>",
         "<p>Residuals are tangencies of the silhouettes of captures held out, robust RMS; the change is the proposed "
         "one, whether or not it is kept. A turn and a shift that make up for each other at the subject may both be "

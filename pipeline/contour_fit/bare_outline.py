@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32
 
 from pipeline.contour_fit.clutter import CELL_PX, is_crown, within
 from pipeline.contour_fit.contour import ContourSolution, run_stage
-from pipeline.contour_fit.noise_model import with_misfit
+from pipeline.contour_fit.noise_model import update_noise
 from pipeline.contour_fit.problem import ContourProblem, State
 from pipeline.contour_fit.rim import Views
 from pipeline.contour_fit.rim_term import observed_rim
@@ -36,7 +36,7 @@ REACH_MM = 30.0  # from the outline to a rim that belongs to it
 MISSED_PX = 1.0  # a crown whose outline is farther off is fitted once more
 
 
-def with_bare_outline(solved: ContourSolution, skin: Mapping[str, Plane]) -> ContourSolution:
+def fit_bare_outline(solved: ContourSolution, skin: Mapping[str, Plane]) -> ContourSolution:
     """Finds the outline of a bald crown, and fits the head once more with this outline at full weight.
 
     Args:
@@ -50,10 +50,10 @@ def with_bare_outline(solved: ContourSolution, skin: Mapping[str, Plane]) -> Con
         return solved
     bare = find_bare(solved.problem, solved.state, skin)
     crown, shown = _shown_crown(solved, bare)
-    return with_counted_crown(solved, bare) if shown.any() and shown.sum() >= BARE_SHARE * crown.sum() else solved
+    return refit_with_crown(solved, bare) if shown.any() and shown.sum() >= BARE_SHARE * crown.sum() else solved
 
 
-def with_counted_crown(solved: ContourSolution, cells: tuple[Bool[np.ndarray, "_ _"], ...]) -> ContourSolution:
+def refit_with_crown(solved: ContourSolution, cells: tuple[Bool[np.ndarray, "_ _"], ...]) -> ContourSolution:
     """Fits the head once more, with full weight for the crown's outline in the marked ``cells`` of each view.
 
     Skips the fit and only adds the marked cells if the whole head's outline already has full weight, or if the crown's
@@ -68,7 +68,7 @@ def with_counted_crown(solved: ContourSolution, cells: tuple[Bool[np.ndarray, "_
     coarse = replace(solved.stage, level="p95", scales_px=(20.0, 10.0, 5.0, 2.0 * scale), steps=4)
     state, spent, _ = run_stage(problem, evidence, solved.state, coarse, lambda fraction: None)
     state, more, reason = run_stage(problem, evidence, state, solved.stage, lambda fraction: None)
-    evidence = with_misfit(problem, evidence, state, solved.stage)
+    evidence = update_noise(problem, evidence, state, solved.stage)
     evaluations = solved.evaluations + spent + more
     return replace(solved, evidence=evidence, state=state, evaluations=evaluations, termination_reason=reason)
 
@@ -89,13 +89,13 @@ def find_bare(problem: ContourProblem, state: State, skin: Mapping[str, Plane]) 
         distance = views.distance_map(k)
         depth = camera.camera_from_world.apply(state.world_from_head.translation)[2]
         if camera.name in skin:
-            maps.append(bare_cells(distance, skin[camera.name], camera.intrinsics.fx / depth))
+            maps.append(mark_bare_cells(distance, skin[camera.name], camera.intrinsics.fx / depth))
         else:
-            maps.append(cells_along(np.zeros((0, 2)), np.zeros(0, bool), distance.shape, 0.0))
+            maps.append(mark_cells(np.zeros((0, 2)), np.zeros(0, bool), distance.shape, 0.0))
     return tuple(maps)
 
 
-def bare_cells(distance: Plane, skin: Plane, px_per_mm: float) -> Bool[np.ndarray, "_ _"]:
+def mark_bare_cells(distance: Plane, skin: Plane, px_per_mm: float) -> Bool[np.ndarray, "_ _"]:
     """Marks the square cells (``CELL_PX`` pixels wide) of one view that lie within ``REACH_MM`` of a bald scalp's
     outline, which is smooth and borders on skin.
 
@@ -106,13 +106,13 @@ def bare_cells(distance: Plane, skin: Plane, px_per_mm: float) -> Bool[np.ndarra
     """
     outline = largest_outline(distance)
     if outline is None:
-        return cells_along(np.zeros((0, 2)), np.zeros(0, bool), distance.shape, 0.0)
+        return mark_cells(np.zeros((0, 2)), np.zeros(0, bool), distance.shape, 0.0)
     from scipy.ndimage import gaussian_filter1d  # 0.05 s
 
     smooth = gaussian_filter1d(outline, SMOOTH_MM * px_per_mm, axis=0, mode="wrap")
     rough = roughness(distance, smooth, px_per_mm) / px_per_mm
     shown = _pooled(share_inside(distance, skin, smooth, px_per_mm), px_per_mm)
-    return cells_along(outline, (rough < ROUGH_MM) & (shown > MIN_SKIN), distance.shape, REACH_MM * px_per_mm)
+    return mark_cells(outline, (rough < ROUGH_MM) & (shown > MIN_SKIN), distance.shape, REACH_MM * px_per_mm)
 
 
 def largest_outline(distance: Plane) -> Float[np.ndarray, "n 2"] | None:
@@ -121,7 +121,7 @@ def largest_outline(distance: Plane) -> Float[np.ndarray, "n 2"] | None:
     return max(outlines, key=len)[:, 0].astype(float) if outlines else None
 
 
-def cells_along(
+def mark_cells(
     outline: Float[np.ndarray, "n 2"], chosen: Bool[np.ndarray, " n"], shape: tuple[int, int], reach_px: float
 ) -> Bool[np.ndarray, "_ _"]:
     """Marks the square cells (``CELL_PX`` pixels wide) of a picture of ``shape`` (rows, columns) that lie within
@@ -178,7 +178,7 @@ class CapOutline:
     cells: Mapping[str, Bool[np.ndarray, "_ _"]]
 
 
-def without_cap(
+def shrink_cap_outlines(
     silhouettes: Mapping[str, Silhouette], cap: Cap, rig: Rig, at_world: Float[np.ndarray, " 3"]
 ) -> CapOutline:
     """Moves the outlines inwards by the wig cap's thickness wherever the cap forms the outline.
@@ -197,7 +197,7 @@ def without_cap(
         if outline is None:
             continue
         shown = share_inside(seen.distance, cap.masks[name].astype(np.float32), outline, px_per_mm) > SHOWN
-        cells[name] = cells_along(outline, shown, seen.distance.shape, REACH_MM * px_per_mm)
+        cells[name] = mark_cells(outline, shown, seen.distance.shape, REACH_MM * px_per_mm)
         distance = seen.distance + cap.thickness_mm * px_per_mm * _at_pixels(cells[name], seen.distance.shape)
         moved[name] = replace(seen, mask=seen.mask & (distance < 0), distance=distance.astype(np.float32))
     return CapOutline(moved, cells)

@@ -44,14 +44,14 @@ def find_clutter(problem: ContourProblem, rim: Rim, threshold_px: float) -> tupl
     return tuple(maps)
 
 
-def without_clutter(evidence: StageEvidence, rim: Rim) -> Rim:
+def drop_clutter(evidence: StageEvidence, rim: Rim) -> Rim:
     """Returns the rim with zero length for the samples in cells that ``evidence`` marks as clutter."""
     if evidence.noise.clutter is None:
         return rim
     return replace(rim, length=np.where(within(evidence.noise.clutter, rim), 0.0, rim.length))
 
 
-def with_bare_crown(
+def restore_bare_crown(
     problem: ContourProblem, evidence: StageEvidence, rim: Rim, length: Float[np.ndarray, " s"], level: str
 ) -> Rim:
     """Restores the weight of a bald crown: rim samples above the brows, in cells marked as bald, get their full

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from pipeline.compute.trace import traced
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.head_problem import started_problem
-from pipeline.contour_fit.noise_model import is_hairless, with_clutter_of_start, with_misfit
-from pipeline.contour_fit.posterior import cage_variance, with_estimated_prior
+from pipeline.contour_fit.noise_model import is_hairless, mark_start_clutter, update_noise
+from pipeline.contour_fit.posterior import cage_variance, estimate_prior
 from pipeline.contour_fit.problem import (
     FIRST_CORRELATION_PX,
     POSE,
@@ -28,7 +28,7 @@ from pipeline.contour_fit.problem import (
     first_evidence,
     make_problem,
     start_state,
-    widened,
+    widen,
 )
 from pipeline.contour_fit.rim_term import observed_rim
 from pipeline.estimation.levenberg_marquardt import Limits, minimise
@@ -84,7 +84,7 @@ def solve_contour(
     few, span, whole, *rest = schedule(settings, len(model.modes))
     evidence, state = first_evidence(settings), start_state(problem, world_from_head)
     if landmarks is not None:
-        evidence = with_clutter_of_start(problem, evidence, state, few)
+        evidence = mark_start_clutter(problem, evidence, state, few)
     state, spent, reason = run_stage(problem, evidence, state, few, lambda f: report("fit", 0.2 * f))
     state, used, reason = run_stage(problem, evidence, state, span, lambda f: report("fit", 0.2 + 0.2 * f))
     tried, more, _ = run_stage(problem, evidence, state, whole, lambda f: report("fit", 0.4 + 0.1 * f))
@@ -92,7 +92,7 @@ def solve_contour(
     bare = is_hairless(problem, evidence, tried, whole, state)
     if bare:
         state, span = tried, whole
-    evidence = with_misfit(problem, evidence, state, span)
+    evidence = update_noise(problem, evidence, state, span)
     stage = span
     for i, stage in enumerate(rest):
         stage = replace(stage, whole_head=bare)
@@ -100,7 +100,7 @@ def solve_contour(
             problem, evidence, state, stage, lambda f, i=i: report("fit", 0.5 + 0.5 * (i + f) / len(rest))
         )
         spent += used
-        evidence = with_misfit(problem, evidence, state, stage)
+        evidence = update_noise(problem, evidence, state, stage)
     return ContourSolution(problem, evidence, state, stage, spent, reason)
 
 
@@ -140,7 +140,7 @@ def run_stage(
     evaluations, reason = 0, "step limit"
     for i, scale in enumerate(stage.scales_px):
         report(i / len(stage.scales_px))
-        seen = coarsened(evidence, scale) if scale > problem.settings.robust_px else evidence
+        seen = coarsen(evidence, scale) if scale > problem.settings.robust_px else evidence
         whole, at_start = started_problem(problem, seen, stage, max(scale, evidence.noise.floor_px), state)
         found = minimise(whole, state, limits, at_start=at_start)
         state, reason = found.value, found.evidence.termination_reason
@@ -148,7 +148,7 @@ def run_stage(
     return state, evaluations, reason
 
 
-def coarsened(evidence: StageEvidence, scale_px: float) -> StageEvidence:
+def coarsen(evidence: StageEvidence, scale_px: float) -> StageEvidence:
     """Returns the evidence for steps with a large scale of the robust loss. The outline's noise l sigma^2 (px^3) is
     raised to match a sigma of half the scale, at a fixed correlation length l.
 
@@ -202,7 +202,7 @@ def finish(solved: ContourSolution) -> Fit:
     )
 
 
-def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_mm: float) -> Fit:
+def add_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_mm: float) -> Fit:
     """Returns a fit with an estimate of the shape error that the eigenheads cannot represent.
 
     Few heads are exact combinations of the eigenheads, and the fit's covariance does not include the deviation. The
@@ -213,15 +213,15 @@ def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_
     Args:
         solved: solution with the eigenheads alone.
         wider_model: the same mesh and eigenheads, followed by the kernel's modes.
-        relief_mm: as in ``with_estimated_prior``.
+        relief_mm: as in ``estimate_prior``.
     """
     fit, eigenheads = finish(solved), len(solved.state.coefficients)
-    problem = widened(solved.problem, wider_model, (LEVEL,))
+    problem = widen(solved.problem, wider_model, (LEVEL,))
     last = solved.problem.settings.robust_px
     stage = Stage(LEVEL, len(wider_model.modes), True, (2.0 * last, last), solved.stage.whole_head, True, STEPS)
     state, evaluations, reason = run_stage(problem, solved.evidence, solved.state, stage, lambda fraction: None)
     wider = finish(ContourSolution(problem, solved.evidence, state, stage, evaluations, reason))
-    wider = with_estimated_prior(wider_model, wider, eigenheads, relief_mm=relief_mm)
+    wider = estimate_prior(wider_model, wider, eigenheads, relief_mm=relief_mm)
     return judged_by(wider_model, wider, solved.problem.model, fit)
 
 

@@ -28,7 +28,7 @@ BOUND = 0.99  # weight that would be larger if it could
 LIDS = re.compile("eye(?!brow)")  # names of expressions that move lids or gaze
 
 
-def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> ContourSolution:
+def solve_expressions(solved: ContourSolution, eigenheads: int) -> ContourSolution:
     """Solves once more for shape and expression, with the prior variance of each group of modes estimated from the fit.
     A neutral face is returned unchanged.
 
@@ -59,7 +59,7 @@ def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> Contou
         now = state.coefficients + step[:count]
         covariance = inverse_diagonal(whole)
         for group in groups:
-            variance[group] = estimated_variance(now, covariance, variance, group)
+            variance[group] = estimate_variance(now, covariance, variance, group)
     return replace(solved, state=apply_step(state, step, solved.stage))
 
 
@@ -82,7 +82,7 @@ def doubtful_weights(model: HeadModel, coefficients: Float[np.ndarray, " m"]) ->
     return frozenset(int(row) for row in np.concatenate(found) if not LIDS.match(model.expressions.names[row]))
 
 
-def estimated_variance(
+def estimate_variance(
     coefficients: Float[np.ndarray, " m"],
     covariance: Float[np.ndarray, " p"],
     before: Float[np.ndarray, " m"],

@@ -21,7 +21,7 @@ FLOOR_SIGMAS, MAX_FLOOR_PX = 3.0, 6.0
 MIN_UNIT = 1.0  # px^3: noise of 0.5 px over 4 px. No upper limit: 40 let long hair before a face pull it 5 mm away
 
 
-def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> StageEvidence:
+def update_noise(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> StageEvidence:
     """Updates the evidence from the residuals of a stage: the outlines' noise, the lower limit of the robust loss's
     scale and, the first time, the clutter (hair and clothes).
 
@@ -35,14 +35,12 @@ def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, 
     clutter, settled = evidence.noise.clutter, evidence.noise.is_settled
     if not settled and not stage.whole_head:  # a bare head has none
         clutter, settled = find_clutter(problem, rim, max(CLUTTER_PX, CLUTTER_SIGMAS * deviation)), True
-    unit = estimated_unit(problem, rim, 2.0 * floor) or evidence.noise.unit
+    unit = estimate_unit(problem, rim, 2.0 * floor) or evidence.noise.unit
     noise = replace(evidence.noise, unit=unit, floor_px=floor, clutter=clutter, is_settled=settled)
     return StageEvidence(noise, evidence.photographs)
 
 
-def with_clutter_of_start(
-    problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage
-) -> StageEvidence:
+def mark_start_clutter(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> StageEvidence:
     """Marks clutter before the first fit: wherever the silhouette reaches more than ``START_CLUTTER_MM`` beyond the
     mean head at the start pose.
 
@@ -56,7 +54,7 @@ def with_clutter_of_start(
     return replace(evidence, noise=replace(evidence.noise, clutter=clutter))
 
 
-def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float | None:
+def estimate_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float | None:
     """Estimates the outlines' noise l sigma^2 (px^3) from their residuals, which include the model's misfit. Returns
     None if the settings give both the noise sigma and the correlation length l.
 

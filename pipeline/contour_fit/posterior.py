@@ -2,14 +2,14 @@
 
 Where no photograph constrains the surface, mostly under hair, the posterior equals the prior, so the prior's variance
 must be right. Under hair a head of the model's population deviates by half of the kernel's standard deviation, a head
-of another population by its double. ``with_estimated_prior`` therefore estimates the prior's variance from the
+of another population by its double. ``estimate_prior`` therefore estimates the prior's variance from the
 coefficients that the photographs determine (the evidence framework; MacKay 1992, *Bayesian interpolation*,
 https://doi.org/10.1162/neco.1992.4.3.415).
 
 Two errors that no shape coefficient describes are added to the standard deviation. The kernel moves the surface along
 its normals only, but landmarks of real heads also shift along the surface. The shift along the surface gets the
 standard deviation that the kernel has along the normal (``Fit.sliding_mm``). The second additional error of a vertex is
-relief finer than the modes. A fit of eigenheads alone contains neither error (see ``with_span_misfit``).
+relief finer than the modes. A fit of eigenheads alone contains neither error (see ``add_span_misfit``).
 """
 
 import math
@@ -35,7 +35,7 @@ EAR_MISFIT_MM = 5.0  # where the face says that an ear sits, by the variance rat
 
 
 @traced
-def with_estimated_prior(model: HeadModel, fit: Fit, eigenheads: int, *, relief_mm: float) -> Fit:
+def estimate_prior(model: HeadModel, fit: Fit, eigenheads: int, *, relief_mm: float) -> Fit:
     """Returns the fit with a covariance whose prior variance is estimated from the fit itself.
 
     If ``C`` is the covariance under unit priors, a group of modes gets the prior variance ``s^2 = sum z^2 / sum (1 -

@@ -286,7 +286,7 @@ def blended_basis(
     return (mean[at] * blend[:, :, None]).sum(axis=1), blended
 
 
-def widened(problem: ContourProblem, model: HeadModel, levels: tuple[str, ...]) -> ContourProblem:
+def widen(problem: ContourProblem, model: HeadModel, levels: tuple[str, ...]) -> ContourProblem:
     """Returns the problem for another head ``model`` with the same mesh and more modes. Keeps only the mesh resolutions
     named in ``levels``."""
     features = problem.features

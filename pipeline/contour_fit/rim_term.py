@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from pipeline.compute.threads import in_threads
-from pipeline.contour_fit.clutter import downweight_outside_contour, with_bare_crown, without_clutter
+from pipeline.contour_fit.clutter import downweight_outside_contour, drop_clutter, restore_bare_crown
 from pipeline.contour_fit.problem import PER_CAMERA, POSE, ContourProblem, Stage, StageEvidence, State, moved_views
 from pipeline.contour_fit.rim import Rim, find_rim
 from pipeline.contour_fit.rim_kernels import Level, RimSamples, fill_rows
@@ -40,10 +40,10 @@ def observed_rim(problem: ContourProblem, evidence: StageEvidence, state: State,
     fine, whole = stage.level == "full", stage.whole_head or stage.contained
     views = moved_views(problem, state)
     rim = find_rim(problem.topologies[stage.level], vertices, views, whole_head=whole, averaged=fine)
-    counted = without_clutter(evidence, rim)
+    counted = drop_clutter(evidence, rim)
     if stage.contained and not stage.whole_head:
         counted = downweight_outside_contour(problem, evidence, counted, stage.level)
-    return with_bare_crown(problem, evidence, counted, rim.length, stage.level)
+    return restore_bare_crown(problem, evidence, counted, rim.length, stage.level)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

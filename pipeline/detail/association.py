@@ -159,7 +159,7 @@ def observe(
     )
 
 
-def with_patches(
+def add_patches(
     observed: Observed, found: PatchMeasurements, base: Vertices, current: Vertices, faces: Faces, robust_mm: float
 ) -> Observed:
     """Adds the patches' measurements on the head ``current``, and drops the observations from dense matching within

@@ -52,7 +52,7 @@ def estimate_eyelid_closure(
     Args:
         fit: the head fitted to the photographs.
         model: with the modes that the fit has.
-        base: the fitted head with smooth lids (``with_plain_lids``), full mesh, world frame, mm.
+        base: the fitted head with smooth lids (``replace_lids``), full mesh, world frame, mm.
         surface: the measured surface points, world frame.
         eyes: appearance of the eyes in the photographs. An eye that shows neither white nor iris counts as closed
             unless the points contradict it.

@@ -47,7 +47,7 @@ class SurfacePoints:
         return SurfacePoints(self.points[rows], self.normals[rows], self.deviation_mm[rows], self.part[rows])
 
 
-def thinned(surface: SurfacePoints, cell_mm: float) -> SurfacePoints:
+def thin(surface: SurfacePoints, cell_mm: float) -> SurfacePoints:
     """Replaces the points in each cell of a grid that have the same part and main direction of the normal by their
     mean, weighted by information.
 
@@ -90,7 +90,7 @@ def dense_points(depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_w
         return SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.uint8))
     points, normals, deviation = (np.concatenate(column) for column in zip(*clouds, strict=True))
     # A million pixels, a tenth of that in cells.
-    cells = thinned(SurfacePoints(points, normals, deviation, np.zeros(len(points), np.uint8)), CELL_MM)
+    cells = thin(SurfacePoints(points, normals, deviation, np.zeros(len(points), np.uint8)), CELL_MM)
     share = part_shares(votes, cells.points)
     part = codes_from_channels(share.argmax(axis=1))
     # What may be hair may lie where hair does: the deviation of both together.

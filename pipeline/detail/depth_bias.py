@@ -66,7 +66,7 @@ def measure_bias(seen: OnFace) -> WindowBias:
     return WindowBias(float(np.clip(line[0], -MAX_MM, MAX_MM)), float(np.clip(line[1], 0.0, MAX_SHARE)))
 
 
-def without_window_bias(surface: SurfacePoints, seen: OnFace, bias: WindowBias) -> SurfacePoints:
+def remove_window_bias(surface: SurfacePoints, seen: OnFace, bias: WindowBias) -> SurfacePoints:
     """Returns the points with the bias of the matching windows removed. Every point moves along its normal by the
     common bias. Points on the face also move by ``share`` times the windowed height."""
     points = surface.points - bias.common_mm * surface.normals

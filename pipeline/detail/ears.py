@@ -48,7 +48,7 @@ class Motion:
     shown: int
 
 
-def with_ears_in_place(vertices: Vertices, model: HeadModel, surface: SurfacePoints) -> Vertices:
+def move_ears(vertices: Vertices, model: HeadModel, surface: SurfacePoints) -> Vertices:
     """Returns the head with each ear moved to the skin points near it. An ear with too few measurements does not move.
 
     Args:

@@ -77,7 +77,7 @@ def reading_basis(population: HeadModel, model: HeadModel, eigenheads: int) -> R
     return ReadingBasis(kept["vertex"], kept["mean"], kept["modes"], len(population.modes), faces)
 
 
-def with_read_expression(
+def read_expression(
     fit: Fit,
     model: HeadModel,
     population: HeadModel,

@@ -169,7 +169,7 @@ def _lids(slit: Fissure) -> Int[np.ndarray, " r"]:
     return np.flatnonzero(slit.ellipse(half_length, half_height, -BRIDGE_RAISED * slit.length_mm))
 
 
-def with_plain_lids(vertices: Vertices, shape: Vertices, model: HeadModel) -> Vertices:
+def replace_lids(vertices: Vertices, shape: Vertices, model: HeadModel) -> Vertices:
     """Replaces the lids by those of ``shape``, displaced smoothly to meet the skin around them.
 
     Displacements along the normals would tear lids, because the normals at the lids' margins point at each other.

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.sparse.linalg import cg
 from scipy.spatial import KDTree
 
-from pipeline.fusion.untangling import Topology, topology_of, untangled
+from pipeline.fusion.untangling import Topology, topology_of, untangle
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.part_labels.codes import Part
 from rig.mesh import Mesh, vertex_normals
@@ -60,7 +60,7 @@ def hair_shell(head: Mesh, bust: Mesh, part: UInt8[np.ndarray, " b"]) -> HairShe
     field = np.maximum(_solved(bending, STIFFNESS, weights, heights[:, None])[:, 0], 0.0)
     out = head.vertices + field[:, None] * directions
     out = _pulled(out, head, surface, part[bust.faces].max(axis=1) == Part.HAIR, bending, field > INSIDE_MM)
-    out = _outside(untangled(_outside(out, head), topology), head)
+    out = _outside(untangle(_outside(out, head), topology), head)
     height = np.linalg.norm(out - head.vertices, axis=1)
     return HairShell(out, height, covered_share(Mesh(out, head.faces), bust, part))
 

@@ -19,11 +19,11 @@ from jaxtyping import Bool, Int
 
 from pipeline.compute.trace import traced
 from pipeline.contour_fit.fit import Fit
-from pipeline.detail.association import Faces, PerVertex, Round, Vertices, observe, typical_deviation, with_patches
+from pipeline.detail.association import Faces, PerVertex, Round, Vertices, add_patches, observe, typical_deviation
 from pipeline.detail.blink import blink_shift, estimate_eyelid_closure, plain_shape
-from pipeline.detail.dense_points import CELL_MM, SurfacePoints, thinned
-from pipeline.detail.ears import with_ears_in_place
-from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids, with_plain_lids
+from pipeline.detail.dense_points import CELL_MM, SurfacePoints, thin
+from pipeline.detail.ears import move_ears
+from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids, replace_lids
 from pipeline.detail.outline_points import Outlines, OutlineSearch
 from pipeline.detail.patch_points import PatchMeasurements, PatchSearch
 from pipeline.detail.smooth_field import smooth_field
@@ -37,7 +37,7 @@ from pipeline.detail.solve import (
     solve_field,
     solving_nodes,
 )
-from pipeline.fusion.untangling import untangled_head
+from pipeline.fusion.untangling import untangle_head
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
@@ -111,14 +111,14 @@ def refine_to_surface(
     faces = model.levels["full"].faces
     fitted = fit.world_from_head.apply(model.vertices(fit.coefficients))
     shape = plain_shape(fit, model, eigenheads)
-    base = with_plain_lids(fitted, shape, model)
+    base = replace_lids(fitted, shape, model)
     lids, unexplained = estimate_eyelid_closure(fit, model, base, surface, eyes or {})
     closed = frozenset(side for side, eye in (eyes or {}).items() if eye.closed and lids.get(side, 1.0) == 1.0)
     blink = blink_shift(fit, model, lids)
     base = unfold(shape + blink, base + blink, faces)
     base = bridge_eyelids(base, model, closed.difference(lids) | unexplained)
-    surface = thinned(surface, CELL_MM)  # a million points of depth maps, a fiftieth of that in cells
-    base = with_ears_in_place(base, model, thinned(surface, COARSE_CELL_MM))
+    surface = thin(surface, CELL_MM)  # a million points of depth maps, a fiftieth of that in cells
+    base = move_ears(base, model, thin(surface, COARSE_CELL_MM))
     regions = head_regions(model)
     head = deform_to_points(
         base,
@@ -131,7 +131,7 @@ def refine_to_surface(
         outlines=outlines and outlines.observe,
         report=report,
     )
-    clean, clean_deviation_mm = untangled_head(model, head.vertices, head.deviation_mm)
+    clean, clean_deviation_mm = untangle_head(model, head.vertices, head.deviation_mm)
     observed = head.observed & (clean_deviation_mm < 2.0 * head.deviation_mm)  # what was moved farther is not as seen
     return DeformedSurface(clean.vertices, clean_deviation_mm, observed, closed | unexplained, lids)
 
@@ -168,8 +168,8 @@ def deform_to_points(
     """
     amplitude = np.maximum(deviation_mm, MIN_AMPLITUDE_MM)
     informative = (surface.part != Part.UNSEEN) & np.isfinite(surface.deviation_mm)
-    fine_points = thinned(surface.chosen(informative), CELL_MM)
-    coarse_points = thinned(fine_points, COARSE_CELL_MM)
+    fine_points = thin(surface.chosen(informative), CELL_MM)
+    coarse_points = thin(fine_points, COARSE_CELL_MM)
     current = _coarsely_deformed(
         vertices, amplitude, faces, nodes.coarse, coarse_points, loose=loose, outlines=outlines, report=report
     )
@@ -179,13 +179,13 @@ def deform_to_points(
     directions = normal_directions(nodes.fine, nodes.fine.shape @ amplitude, normals)
     report("fine", len(COARSE) / (len(COARSE) + 1))
     dense = observe(base, current, faces, fine_points, loose, limits=FINE, floor_mm=FLOOR_MM)
-    posterior = solve_field(field, directions, with_outlines(dense.observed, outlines, base, current, FINE.robust_mm))
+    posterior = solve_field(field, directions, add_outlines(dense.observed, outlines, base, current, FINE.robust_mm))
     current = base + directions.moved(posterior.mean)
     for robust_mm in PATCH_ROUNDS_MM:
         if measure_patches is None:
             break
-        combined = with_patches(dense.observed, measure_patches(current), base, current, faces, robust_mm)
-        posterior = solve_field(field, directions, with_outlines(combined, outlines, base, current, robust_mm))
+        combined = add_patches(dense.observed, measure_patches(current), base, current, faces, robust_mm)
+        posterior = solve_field(field, directions, add_outlines(combined, outlines, base, current, robust_mm))
         current = base + directions.moved(posterior.mean)
     seen = np.zeros(len(vertices), bool)
     seen[dense.corner] = True
@@ -212,12 +212,12 @@ def _coarsely_deformed(
     for i, limits in enumerate(COARSE):
         report("fine", i / (len(COARSE) + 1))
         dense = observe(vertices, current, faces, coarse_points, loose, limits=limits, floor_mm=COARSE_FLOOR_MM)
-        combined = with_outlines(dense.observed, outlines, vertices, current, limits.robust_mm)
+        combined = add_outlines(dense.observed, outlines, vertices, current, limits.robust_mm)
         current = vertices + directions.moved(solve_field(field, directions, combined).mean)
     return current
 
 
-def with_outlines(
+def add_outlines(
     observed: Observed, outlines: Outlines | None, base: Vertices, current: Vertices, robust_mm: float
 ) -> Observed:
     """Adds the observations from the outlines, if there are any, to the observations from points."""

@@ -172,7 +172,7 @@ class LimbusFit:
         return float((1.0 / (1.0 + (self.offsets / AGREED_PX) ** 2) ** 2).sum())
 
 
-def fitted(
+def fit_limbus(
     seen: Sequence[EyeSight], circle: LimbusCircle, eyeball: Float[np.ndarray, " 3"], reaches: Sequence[float]
 ) -> LimbusFit | None:
     """Fits a limbus to the edges in all views. Returns None if too few views agree.
@@ -405,10 +405,10 @@ def find_irises(
     right, left = out["right"], out["left"]
     if isinstance(right, Iris) and isinstance(left, Iris):
         out["right"], out["left"] = looking_together(right, left, axes)
-    return believed(out, axes[:, 2])
+    return reject_gazes(out, axes[:, 2])
 
 
-def believed(eyes: Mapping[str, Iris | UnseenEye], ahead: Float[np.ndarray, " 3"]) -> dict[str, Iris | UnseenEye]:
+def reject_gazes(eyes: Mapping[str, Iris | UnseenEye], ahead: Float[np.ndarray, " 3"]) -> dict[str, Iris | UnseenEye]:
     """Rejects impossible gazes: two gazes that differ by more than ``MAX_BETWEEN_DEG``, or a single gaze more than
     ``MAX_ALONE_DEG`` from the direction of the face, ``ahead`` (a unit vector)."""
     gazes = [eye.gaze for eye in eyes.values() if isinstance(eye, Iris)]
@@ -478,7 +478,7 @@ def _first_fit(eye: _Eye, ahead: Float[np.ndarray, " 3"]) -> LimbusFit | UnseenE
     if len(_large(start, facing)) < MIN_VIEWS:
         return UnseenEye("coarse")
     starts = [replace(start, centre=centre + lift * eye.up) for lift in LIFTS_MM]
-    fits = [fit for each in starts if (fit := fitted(_large(each, eye.seen), each, eye.eyeball, REACHES)) is not None]
+    fits = [fit for one in starts if (fit := fit_limbus(_large(one, eye.seen), one, eye.eyeball, REACHES)) is not None]
     return max(fits, key=lambda fit: fit.agreement, default=UnseenEye("unclear"))
 
 
@@ -499,7 +499,7 @@ def _together(fits: Mapping[str, LimbusFit | UnseenEye], eyes: Mapping[str, _Eye
         for gaze, lift in product((beside, fit.circle.gaze + beside), LIFTS_MM):
             centre = fit.circle.centre + lift * eyes[side].up
             start = LimbusCircle(centre, gaze / np.linalg.norm(gaze), eyes[side].up)
-            again = fitted(_large(start, eyes[side].seen), start, eyes[side].eyeball, REACHES_AGAIN)
+            again = fit_limbus(_large(start, eyes[side].seen), start, eyes[side].eyeball, REACHES_AGAIN)
             if again is not None and again.agreement > MORE_AGREED * best.agreement:
                 best = again
         out[side] = best

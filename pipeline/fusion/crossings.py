@@ -63,7 +63,7 @@ def _crossing(
 
 
 @traced
-def without_coincidences(mesh: Mesh) -> Mesh:
+def separate_coincidences(mesh: Mesh) -> Mesh:
     """Separates vertices that coincide in single precision, as files store them, by a small move towards the mean of
     their neighbours. Without this shift, a program that merges vertices by position would join separate sheets of the
     surface."""

@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.compute.trace import traced
-from pipeline.fusion.crossings import without_coincidences
+from pipeline.fusion.crossings import separate_coincidences
 from pipeline.fusion.grid_kernels import component_of, compose_well
 from pipeline.fusion.hair import (
     STRAND_SHARE,
     Places,
-    grown_to_outlines,
+    extend_to_outlines,
     parts_over_head,
     shell_deviation_mm,
     smooth_unresolved,
@@ -28,8 +28,8 @@ from pipeline.fusion.refinement import (
     SeenVertices,
     deviation_mm,
     refine_vertices,
+    remove_islands,
     seen_deviation_mm,
-    without_islands,
 )
 from pipeline.fusion.signed_distance import HeadEars, Level, NoSurface, solve
 from pipeline.fusion.skin import HeadSkin, combine_with_head
@@ -40,7 +40,7 @@ from pipeline.geometry.surface_nets import surface_net
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.votes import PartVotes, part_codes, part_shares
-from pipeline.stereo.depth_map import DepthMap, WindowBias, without_bias
+from pipeline.stereo.depth_map import DepthMap, WindowBias, subtract_bias
 from pipeline.warnings import ReportWarning
 from rig.mesh import Mesh, face_normals
 from rig.messages.message import compose
@@ -131,16 +131,16 @@ def fuse(
     report("bust", 0.8)
     mesh, measured = refine_vertices(net, views, spacing_mm)
     capped = cut.distance_mm(mesh.vertices) > -CAP_STEPS * spacing_mm
-    measured = without_islands(mesh, replace(measured, views=np.where(capped, 0, measured.views).astype(np.uint8)))
+    measured = remove_islands(mesh, replace(measured, views=np.where(capped, 0, measured.views).astype(np.uint8)))
     names = [depth_map.camera.name for depth_map in maps]
     warnings = tuple(mask_warnings(names, contradicted))
-    straight = without_bias(mesh, measured.views > 0, bias)
+    straight = subtract_bias(mesh, measured.views > 0, bias)
     shell_mm = None if hair is None else shell_deviation_mm(hair, views)
     return DepthSurface(straight, safe, measured, warnings, capped, scatter, shell_mm)
 
 
 @traced
-def finished(
+def finish_bust(
     surface: DepthSurface,
     votes: PartVotes | None,
     head: HeadSkin | None,
@@ -174,10 +174,10 @@ def finished(
     hair = np.maximum(strands, neck) if few else strands
     mesh = smooth_unresolved(mesh, hair, clothes, neck, noise_mm=noise_mm, seen=seen_vertices, held=surface.capped)
     if surface.shell_deviation_mm is None:
-        mesh, moved_mm = grown_to_outlines(mesh, strands, silhouettes, rig)
+        mesh, moved_mm = extend_to_outlines(mesh, strands, silhouettes, rig)
     topology = topology_of(mesh.faces, len(seen))
     smooth = smooth_spots(mesh.vertices, topology, surface.safe_world)  # no triangles cross
-    clean = without_coincidences(Mesh(smooth, mesh.faces))
+    clean = separate_coincidences(Mesh(smooth, mesh.faces))
     mended_mm = np.linalg.norm(clean.vertices - mesh.vertices, axis=1)
     mesh = clean
     part = np.where(seen, shown, Part.UNSEEN).astype(np.uint8)

@@ -2,7 +2,7 @@
 
 In hair, dense matching finds chance patterns of strands. The depth of hair therefore scatters over millimetres, and the
 fused surface would be rough, with pockets and handles. Therefore depth of hair gets a small weight in the signed
-distance (``loosened``), and hair vertices are smoothed. Matching also looks through strands to the dense core of the
+distance (``loosen_hair``), and hair vertices are smoothed. Matching also looks through strands to the dense core of the
 hair or to the scalp. Therefore hair at the silhouettes' rims is moved outwards until it is as far inside all
 silhouettes as visible strands. Hair with a smooth surface has depth nearly everywhere, and is not changed.
 
@@ -91,7 +91,7 @@ def find_silent_hair(
     known = known_share(depth_maps, parts, rig)
     scatter = float(np.interp(known, SCATTERED_SHARE, (1.0, 0.0)))
     if votes is None or known >= SILENT_SHARE:
-        loose = [loosened(each, parts, rig, scatter) for each in depth_maps] if scatter > 0.0 else depth_maps
+        loose = [loosen_hair(each, parts, rig, scatter) for each in depth_maps] if scatter > 0.0 else depth_maps
         return None, loose, scatter
 
     def split(depth_map: DepthMap) -> tuple[Float[np.ndarray, "n 3"], DepthMap]:
@@ -123,7 +123,7 @@ def only_where(kept: Bool[np.ndarray, "h w"], depth_map: DepthMap) -> DepthMap:
     )
 
 
-def without_specks(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> DepthMap:
+def remove_specks(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> DepthMap:
     """Removes isolated depths of skin and clothes from a depth map in which plain clothes have hardly any depth.
     Isolated depths are chance matches and lie centimetres in front of the subject."""
     _, hair, clothes = np.moveaxis(shown_parts(depth_map, parts, rig) > LIKELY, 2, 0)
@@ -160,7 +160,7 @@ def known_share(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], ri
     return 1.0 if hair <= MIN_HAIR * body else float(known / hair)
 
 
-def loosened(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig, scatter: float) -> DepthMap:
+def loosen_hair(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig, scatter: float) -> DepthMap:
     """Returns the depth map with enlarged standard deviations of hair, according to its noise fraction ``scatter``."""
     height, width = depth_map.depth_mm.shape
     hair = np.asarray(cv2.resize(shown_parts(depth_map, parts, rig)[..., Part.HAIR.channel], (width, height)))
@@ -282,7 +282,7 @@ def smooth_unresolved(
 
 
 @traced
-def grown_to_outlines(
+def extend_to_outlines(
     mesh_world: Mesh, hair: Float[np.ndarray, " v"], silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> tuple[Mesh, Float[np.ndarray, " v"]]:
     """Moves the vertices of hair outwards to the hair's end in the silhouettes.

@@ -101,7 +101,7 @@ def measure_vertices(mesh: Mesh, normals: Float[np.ndarray, "v 3"], views: ViewS
     return Measured(offset, information, scatter, seen)
 
 
-def without_islands(mesh: Mesh, measured: Measured) -> Measured:
+def remove_islands(mesh: Mesh, measured: Measured) -> Measured:
     """Discards the measurements on small patches: connected patches of seen triangles with an area below ``ISLAND_MM2``
     then count as unseen."""
     seen = measured.views > 0

@@ -166,7 +166,7 @@ def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: flo
     return Level(grid, field)
 
 
-def votes_at(grid: Grid, views: ViewStack) -> Votes:
+def combine_views(grid: Grid, views: ViewStack) -> Votes:
     """Combines the views at every node of the grid."""
     step = grid.step_mm
     value, weight, bound = (np.zeros(len(grid), np.float32) for _ in range(3))
@@ -180,7 +180,7 @@ def votes_at(grid: Grid, views: ViewStack) -> Votes:
     return Votes(value, weight, bound)
 
 
-def ended(votes: Votes, grid: Grid, cut: Cut) -> Votes:
+def add_bust_end(votes: Votes, grid: Grid, cut: Cut) -> Votes:
     """Adds the surface at which the bust ends to the lower bounds of the votes."""
     reach = REACH * grid.step_mm
     beyond = np.clip(cut.distance_mm(grid.places()), -reach, reach).astype(np.float32)
@@ -241,9 +241,9 @@ def solve(
         shown = np.concatenate([seen, hair])
         agreed = np.concatenate([agreed, np.full(len(hair), VIEWS_SURE)])
     grid = whole_box(*_box(depth_maps, shown, spacing_mm * 2**halvings), spacing_mm * 2**halvings)
-    votes, known = votes_at(grid, views), shown[::THINNED]
+    votes, known = combine_views(grid, views), shown[::THINNED]
     hull_mm, cut = at_points(grid, votes.bound, known), find_cut(grid, views, known, head_world)
-    votes = ended(votes, grid, cut)
+    votes = add_bust_end(votes, grid, cut)
     weight = np.where(agreed[::THINNED] < VIEWS_SURE, ALONE_FACTOR**-2, 1.0)
     guess = _prior(grid, votes, head_world, SeenSurface(known, hull_mm, weight), cut)
     if hair is not None:
@@ -276,7 +276,7 @@ def _finer(
     for _ in range(WIDENINGS + 1):
         grid = refined(coarse, wanted)
         start = grid_kernels.interpolated(box, grid.index)
-        votes = ended(votes_at(grid, views), grid, cut)
+        votes = add_bust_end(combine_views(grid, views), grid, cut)
         if ears is not None:
             votes, start = ears.among(grid, votes, start)
         level = solve_level(grid, votes, start, FINE_SWEEPS, FINE_FACTOR)

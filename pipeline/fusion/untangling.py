@@ -83,7 +83,7 @@ def head_topology(model: HeadModel) -> Topology:
     return topology_of(model.levels["full"].faces, model.levels["full"].count)
 
 
-def untangled_head(
+def untangle_head(
     model: HeadModel, vertices: Vertices, deviation_mm: Float[np.ndarray, " v"]
 ) -> tuple[Mesh, Float[np.ndarray, " v"]]:
     """Repairs the head's bad triangles. Returns the vertices, and their standard deviations enlarged by the distances
@@ -91,7 +91,7 @@ def untangled_head(
 
     ``model``: the head model. ``vertices``: full mesh, mm. ``deviation_mm``: standard deviation of each vertex.
     """
-    clean = untangled(vertices, head_topology(model), clean_mean_head(model))
+    clean = untangle(vertices, head_topology(model), clean_mean_head(model))
     moved_mm = np.linalg.norm(clean - vertices, axis=1)
     return Mesh(clean, model.levels["full"].faces), np.hypot(deviation_mm, moved_mm)
 
@@ -101,13 +101,13 @@ def clean_mean_head(model: HeadModel) -> Vertices:
     """Returns the full mesh of the model's mean head (head frame, mm) without bad triangles."""
 
     def make() -> dict[str, np.ndarray]:
-        return {"vertices": untangled(model.vertices(np.zeros(0)), head_topology(model))}
+        return {"vertices": untangle(model.vertices(np.zeros(0)), head_topology(model))}
 
     inputs = (model.mean, model.levels["full"].faces)
     return cached_arrays("clean-mean-head", inputs, make, made_by=(crossing_faces, component_of, HeadModel))["vertices"]
 
 
-def untangled(vertices: Vertices, topology: Topology, rest: Vertices | None = None) -> Vertices:
+def untangle(vertices: Vertices, topology: Topology, rest: Vertices | None = None) -> Vertices:
     """Repairs all bad regions of a mesh. The repaired mesh is tested in single precision, as files store it.
 
     Args:

@@ -73,7 +73,7 @@ class Excess:
 
 
 @traced
-def without_highlights(
+def darken_highlights(
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], silhouettes: Mapping[str, Silhouette], rig: Rig, head_world: Mesh
 ) -> dict[str, UInt8[np.ndarray, "_ _ 3"]]:
     """Returns the images with the highlights on the head darkened to the skin's own light level.

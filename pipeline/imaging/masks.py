@@ -20,17 +20,17 @@ def box_around(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice
     return slice(max(top - margin, 0), bottom), slice(max(left - margin, 0), right)
 
 
-def eroded(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]:
+def erode(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]:
     """Returns the mask shrunk by a disc of ``steps`` pixels, except at the image's border."""
     return cv2.erode(mask.view(np.uint8), _disc(steps), borderValue=1).view(bool)
 
 
-def dilated(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]:
+def dilate(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]:
     """Returns the mask grown by a disc of ``steps`` pixels."""
     return cv2.dilate(mask.view(np.uint8), _disc(steps)).view(bool)
 
 
-def without_holes(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def fill_holes(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Returns the mask with its holes filled; a hole is background that is not connected to the image's border."""
     _, labels = cv2.connectedComponents((~mask).view(np.uint8), connectivity=4)
     reaching = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))

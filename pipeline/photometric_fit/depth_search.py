@@ -35,7 +35,7 @@ from pipeline.geometry.projection import camera_depths, packed_camera, project_p
 from pipeline.geometry.projection_kernels import rasterise
 from pipeline.geometry.surface_index import facing_cosine
 from pipeline.multiview.triangulation import depth_factor, parallax
-from pipeline.photometric_fit.images import MIN_BLUR_PX, Photographs, blurred
+from pipeline.photometric_fit.images import MIN_BLUR_PX, Photographs, blur_images
 from pipeline.photometric_fit.patch_kernels import (
     Members,
     Pictures,
@@ -269,7 +269,7 @@ def find_places(
     """Searches every patch along its normal for the depth at which its views correlate best. ``scale`` is the number of
     pixels per mm at the head in each camera."""
     steps = np.linspace(-each.reach_mm, each.reach_mm, each.steps)
-    image, noise = blurred(photographs, each.blur_mm * scale)
+    image, noise = blur_images(photographs, each.blur_mm * scale)
     weights, seen = patches.weights(each.window_mm), visibility.facing > 0
     samples = Samples(visibility.pixel, visibility.along, seen)
     pictures = Pictures(views.size, views.offset, image, noise)

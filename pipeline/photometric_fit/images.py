@@ -52,12 +52,12 @@ def fine_texture(photographs: Photographs, views: Views, px_per_mm: Float[np.nda
     a millimetre on the head covers in each view."""
 
     def fine(k: int) -> Float32[np.ndarray, "h w"]:
-        return without_shading(photographs.grey[k], views.distance_map(k) < 0.0, SHADING_MM * float(px_per_mm[k]))
+        return remove_shading(photographs.grey[k], views.distance_map(k) < 0.0, SHADING_MM * float(px_per_mm[k]))
 
     return replace(photographs, grey=tuple(map_in_threads(fine, len(photographs.grey))))
 
 
-def without_shading(
+def remove_shading(
     grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"], sigma_px: float
 ) -> Float32[np.ndarray, "h w"]:
     """Returns the difference between an image and its Gaussian mean over the silhouette; 0 outside the silhouette."""
@@ -85,7 +85,7 @@ def shows_texture(grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h 
     return bool(sharp and exposed > 0.5)
 
 
-def blurred(
+def blur_images(
     photographs: Photographs, sigma_px: Float[np.ndarray, " k"]
 ) -> tuple[Float32[np.ndarray, " n"], np.ndarray]:
     """Blurs each image with its standard deviation ``sigma_px``. Returns all images one after another in a flat array,

@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 from pipeline.compute.array_cache import cached_arrays
 from pipeline.compute.trace import traced
 from pipeline.contour_fit.contour import ContourSolution, run_stage
-from pipeline.contour_fit.problem import PhotoEvidence, Stage, StageEvidence, State, SurfaceObservations, widened
+from pipeline.contour_fit.problem import PhotoEvidence, Stage, StageEvidence, State, SurfaceObservations, widen
 from pipeline.contour_fit.surface_term import surface_residual
 from pipeline.head_model.gaussian_process import with_fine_kernel
 from pipeline.head_model.model import HeadModel
@@ -81,7 +81,7 @@ def refine_with_photographs(
         why = compose("level-views-without-texture", speaking=speaking, all=len(problem.views.names), needed=MIN_VIEWS)
         return solved, Detail("kernel", why)
     model, patches, basis = finer(problem.model)
-    problem = widened(problem, model, (LEVEL,))
+    problem = widen(problem, model, (LEVEL,))
     stage = Stage(LEVEL, len(model.modes), True, solved.stage.scales_px[-1:], solved.stage.whole_head, True, STEPS)
     state, evaluations, reason, share = solved.state, solved.evaluations, solved.termination_reason, 0.0
     evidence = solved.evidence

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from pipeline.imaging.colour_chart import empty_plates
-from pipeline.imaging.masks import dilated, eroded, spread
+from pipeline.imaging.masks import dilate, erode, spread
 from pipeline.segmentation.background import (
     ANY_COLOUR_ODDS,
     CHANNEL_SUM,
@@ -97,10 +97,10 @@ def decide(image: UInt8[np.ndarray, "_ _ 3"], plates: tuple[UInt8[np.ndarray, "_
     probability = smooth_odds(odds, coarse, background)
     raw = probability > 0.5
     away, mixture = find_mixtures(image, coarse, background)
-    paint = spread(coarse, eroded(raw, 1) * away / (1 + mixture**2), 2.0)
+    paint = spread(coarse, erode(raw, 1) * away / (1 + mixture**2), 2.0)
     clear = colours_apart(paint, background.coarse, variance) > CONCLUSIVE
     other, unexplained = _other_colour(coarse - background.coarse, paint, background.coarse, variance)
-    clear &= ~dilated(other, 1)
+    clear &= ~dilate(other, 1)
     plain = (
         clear & (chi2 < MAX_PLATE_CHI2 * np.median(chi2[background.inliers]))
         if background.inliers.any()
@@ -118,7 +118,7 @@ def decide(image: UInt8[np.ndarray, "_ _ 3"], plates: tuple[UInt8[np.ndarray, "_
 def doubtful(decision: Decision) -> Mask:
     """Returns a mask of pixels outside the subject's mask that might show the subject: pixels near it where subject and
     plate look alike. The other cameras decide about such pixels."""
-    near = dilated(decision.mask, REACH) & ~decision.mask
+    near = dilate(decision.mask, REACH) & ~decision.mask
     return near & ~decision.clear & (decision.own_odds > -ALLOWED)
 
 
@@ -141,7 +141,7 @@ def _subject_colour_odds(image: Picture, mask: Mask, paint: Picture, chi2: Plane
     nearby = 0.5 * (chi2 - colours_apart(paint, image, variance) ** 2) - PAINT_ODDS
     bins = (image / (256 / PALETTE)).astype(np.int32).clip(0, PALETTE - 1)
     counts = np.zeros((PALETTE,) * 3, np.float32)
-    np.add.at(counts, tuple(bins[eroded(mask, 1)].T), 1.0)
+    np.add.at(counts, tuple(bins[erode(mask, 1)].T), 1.0)
     for axis in range(3):
         low, high = (np.roll(counts, step, axis) for step in (1, -1))
         counts = 0.5 * counts + 0.25 * (low + high)
@@ -213,7 +213,7 @@ def _closed(mask: Mask) -> Mask:
     """Closes gaps of up to four coarse pixels in the mask. The matting opens real gaps again, for example between locks
     of hair, unless the subject has the backdrop's colour."""
     padded = np.pad(mask, CLOSING, mode="edge")
-    return eroded(dilated(padded, CLOSING), CLOSING)[CLOSING:-CLOSING, CLOSING:-CLOSING]
+    return erode(dilate(padded, CLOSING), CLOSING)[CLOSING:-CLOSING, CLOSING:-CLOSING]
 
 
 def whole_subject(mask: Mask, plain: Mask) -> tuple[Mask, tuple[float, ...]]:
@@ -233,7 +233,7 @@ def whole_subject(mask: Mask, plain: Mask) -> tuple[Mask, tuple[float, ...]]:
     # A gap between hair and shoulder shows the plate where nothing of the subject is like it. Far inside the outline
     # there are few gaps, and something small of the subject may look like the plate by chance.
     small = size < MAX_HOLE_SHARE * subject.sum()
-    inner = np.bincount(holes[eroded(subject | small[holes], HAIR_DEPTH)], minlength=count) > 0.5 * size
+    inner = np.bincount(holes[erode(subject | small[holes], HAIR_DEPTH)], minlength=count) > 0.5 * size
     shown = np.bincount(holes[plain], minlength=count) / size
     gap = (shown > 0.5) & ~(inner & (size <= NOISE_HOLE_COARSE_PX))
     filled = small & ~gap
@@ -288,7 +288,7 @@ def _soft_shadows(candidate: Mask, depth: Plane, strength: Plane) -> Mask:
     soft[0] = False
     found = soft[labels]
     fringe = candidate & (labels == 0)  # too thin for a core of its own
-    return found | (fringe & dilated(found, 3))
+    return found | (fringe & dilate(found, 3))
 
 
 def _means(values: Plane, where: Mask, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

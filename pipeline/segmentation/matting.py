@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from pipeline.imaging.masks import box_around, dilated, eroded, spread
+from pipeline.imaging.masks import box_around, dilate, erode, spread
 from pipeline.segmentation.background import Background
 from pipeline.segmentation.foreground import Decision
 from pipeline.segmentation.mask_kernels import MAX_ALPHA_INFORMATION, solve_alpha
@@ -63,9 +63,9 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision) -> Matte:
     background, mask, clear = decision.background, decision.mask, decision.clear
     probability = np.where(mask, np.maximum(decision.probability, 0.6), np.minimum(decision.probability, 0.4))
     band = int(np.ceil(BAND_PX / max(decision.reduction, FULL_REDUCTION)))
-    undecided = dilated(mask, 2) & ~eroded(mask, 2)
-    undecided |= dilated(decision.mixed, 1) & dilated(mask, band) & ~eroded(mask, DEPTH * band)
-    undecided &= clear | (dilated(mask, 1) & ~eroded(mask, 1))
+    undecided = dilate(mask, 2) & ~erode(mask, 2)
+    undecided |= dilate(decision.mixed, 1) & dilate(mask, band) & ~erode(mask, DEPTH * band)
+    undecided &= clear | (dilate(mask, 1) & ~erode(mask, 1))
     zone = np.where(undecided, np.where(clear, 1, 3), 2 * mask).astype(np.uint8)
     cells = box_around(zone > 0, int(np.ceil(MARGIN_PX / decision.reduction)))
     box = _pixels(cells, zone.shape, image.shape)
@@ -80,7 +80,7 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision) -> Matte:
     better = _subject_inside(cropped, alpha, paint, decision.reduction)
     alpha, contrast, trust = solve_alpha(LINEAR, cropped, plates, light, sigma, zones, guess, better, widths, False)
     alpha = _smooth(alpha, trust, ALPHA_BLUR_PX)
-    unsolved = dilated(contrast < 0, 1) if decision.reduction >= FULL_REDUCTION else contrast < 0
+    unsolved = dilate(contrast < 0, 1) if decision.reduction >= FULL_REDUCTION else contrast < 0
     little = (contrast < WEAK_CONTRAST) | unsolved
     edge = np.abs(alpha - 0.5) < 0.25
     unsure = float(little[edge].mean()) if edge.any() else 0.0
@@ -111,7 +111,7 @@ def _light_outside(
     image: Float32[np.ndarray, "h w 3"], background: Background, mask: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w 3"]:
     """Returns the ratio of the image to the estimated background just outside the subject, extended to all pixels."""
-    clear = ~dilated(mask, 2)
+    clear = ~dilate(mask, 2)
     if not clear.any():
         return np.ones_like(image)
     both = spread(np.concatenate([image, background.coarse], axis=2), clear.astype(np.float32), 2.5)
@@ -127,7 +127,7 @@ def _subject_inside(
     share = min(reduction / FULL_REDUCTION, 1.0)
     step = 2 if share == 1 else 1
     size = (image.shape[1] // step, image.shape[0] // step)
-    inner = eroded(alpha > 0.5, max(2, int(np.ceil(INSIDE_PX * share)))) & (alpha > SOLID)
+    inner = erode(alpha > 0.5, max(2, int(np.ceil(INSIDE_PX * share)))) & (alpha > SOLID)
     sure = cv2.resize(255 * inner.view(np.uint8), size, interpolation=cv2.INTER_AREA) == 255
     colours = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     known = cv2.copyTo(cv2.cvtColor(colours, cv2.COLOR_RGB2RGBA), sure.view(np.uint8))  # 255 in the fourth channel
@@ -141,4 +141,4 @@ def _along_contour(contrast: Plane, alpha: Plane) -> Float32[np.ndarray, " c"]:
     contrast, or 0 if the neighbours are not solved either."""
     mask = alpha > 0.5
     nearby = np.where(contrast < 0, cv2.dilate(contrast, np.ones((3, 3), np.uint8)), contrast)
-    return np.maximum(nearby, np.float32(0))[mask & ~eroded(mask, 1)]
+    return np.maximum(nearby, np.float32(0))[mask & ~erode(mask, 1)]

@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float, Float32, Int8, UInt8
 from pipeline.compute.threads import map_in_threads, task_pool
 from pipeline.compute.trace import traced
 from pipeline.geometry.projection import packed_camera
-from pipeline.imaging.masks import dilated, distance_to_level, eroded
+from pipeline.imaging.masks import dilate, distance_to_level, erode
 from pipeline.imaging.silhouette import Silhouette, ViewQuality, silhouette_from_mask
 from pipeline.multiview.visual_hull import depth_of, hull_extent, mask_extent
 from pipeline.segmentation.background import Background
@@ -168,8 +168,8 @@ def _as_cut(share: Float32[np.ndarray, "h w"], counted: Bool[np.ndarray, "h w"] 
     windows of the cut disagree. Only the outline of the pixels ``counted`` is judged; None means all pixels."""
     alpha, holes = _without_specks(share, np.zeros_like(share))
     mask = alpha > 0.5
-    undecided = dilated(np.abs(share - 0.5) < UNDECIDED, 1)
-    rim = mask & ~eroded(mask, 1)
+    undecided = dilate(np.abs(share - 0.5) < UNDECIDED, 1)
+    rim = mask & ~erode(mask, 1)
     rim = rim if counted is None else rim & counted
     broad = cv2.blur(undecided.astype(np.float32), (UNDECIDED_PX, UNDECIDED_PX)) > UNDECIDED_FILLED
     weak = float(broad[rim].mean()) if rim.any() else 1.0
@@ -207,7 +207,7 @@ def _silhouette(matte: Matte, decision: Decision, counted: Bool[np.ndarray, "h w
     little = matte.contrast < WEAK_CONTRAST
     if counted is not None:
         rim = matte.alpha > 0.5
-        little = little[counted[matte.box][rim & ~eroded(rim, 1)]]
+        little = little[counted[matte.box][rim & ~erode(rim, 1)]]
     weak = float(little.mean()) if len(little) else 1.0
     if counted is None:
         # What lies beside the unsolved is right in four of five places: reason to warn, not to leave the view out.

@@ -60,7 +60,7 @@ class SilhouetteObjective:
         self._mean_world = world_from_head.apply(mean.astype(np.float64))
         self._basis = model.basis(level, len(start)).reshape(len(start), -1)
         faces, region = model.levels[level].faces, model.levels[level].face_region
-        self._drawn = renderer.silhouette_set(rig, lidded(faces, region) if speaking == "face" else faces, scale)
+        self._drawn = renderer.silhouette_set(rig, close_holes(faces, region) if speaking == "face" else faces, scale)
         scaled = self._drawn.rig
         masks = {camera.name: mask_at_scale(silhouettes[camera.name].distance, scale) for camera in rig}
         weights = {
@@ -93,7 +93,7 @@ class SilhouetteObjective:
         return self._mean_world + moved @ self._turn.T
 
 
-def lidded(faces: Int[np.ndarray, "f 3"], face_region: Bool[np.ndarray, " v"]) -> Int[np.ndarray, "g 3"]:
+def close_holes(faces: Int[np.ndarray, "f 3"], face_region: Bool[np.ndarray, " v"]) -> Int[np.ndarray, "g 3"]:
     """Closes every hole of a mesh with a fan of triangles, so that each edge belongs to two triangles. Returns the
     triangles unchanged if a hole reaches the face region, whose outline has weight, or if two holes touch."""
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()

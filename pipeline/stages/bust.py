@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.detail.hair_shell import MIN_COVERED, HairShell, hair_shell
-from pipeline.fusion.fusion import BustSurface, DepthSurface, finished, fuse
-from pipeline.fusion.hair import find_silent_hair, parts_over_head, without_specks
+from pipeline.fusion.fusion import BustSurface, DepthSurface, finish_bust, fuse
+from pipeline.fusion.hair import find_silent_hair, parts_over_head, remove_specks
 from pipeline.fusion.signed_distance import NoSurface
 from pipeline.fusion.skin import HeadSkin
 from pipeline.geometry.nearest import PointTree, nearest
@@ -25,7 +25,7 @@ from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.paint import find_layout, paint_charts, paint_head
-from pipeline.texturing.vertex_colours import Shown, texture
+from pipeline.texturing.vertex_colours import Shown, colour_vertices
 from rig.capture import Capture
 from rig.mesh import Mesh
 from rig.messages.message import compose
@@ -85,7 +85,7 @@ def fuse_depth(
     if settings.outputs.surface == "head":
         return Staged(None)
     parts = None if depth.votes is None else parts_over_head(depth.votes, head_world, stubble=False)
-    solid = map_in_threads(lambda k: without_specks(depth.maps[k], labels.maps, context.rig), len(depth.maps))
+    solid = map_in_threads(lambda k: remove_specks(depth.maps[k], labels.maps, context.rig), len(depth.maps))
     hair, maps, scatter = find_silent_hair(solid, labels.maps, parts, context.rig)
     try:
         surface = fuse(
@@ -124,7 +124,7 @@ def shape_bust(
     if fused is None:
         return Staged(None)
     head = HeadSkin(refined.mesh_world, refined.deviation_mm)
-    surface = finished(fused, votes, head, views.silhouettes, context.rig)
+    surface = finish_bust(fused, votes, head, views.silhouettes, context.rig)
     mesh, face = surface.mesh_world, context.model.levels["full"].face_region
     far, near = nearest(PointTree.of(head.mesh_world.vertices), mesh.vertices)
     on_face = (far < FACE_REACH_MM) & face[near]
@@ -159,7 +159,7 @@ def colour_bust(
     shown = Shown(
         likely, lambda camera, rows: labels.shares(camera, mesh.vertices[rows]), measured=seen, best_views=best
     )
-    colours = texture(mesh, coloured, views.silhouettes, rig, depths, settings=settings.texture, shown=shown)
+    colours = colour_vertices(mesh, coloured, views.silhouettes, rig, depths, settings=settings.texture, shown=shown)
     atlas = paint_charts(mesh, normals, colours, head_axes, np.flatnonzero(seen), settings.outputs.texture_size)
     return Staged(Bust(shaped, normals, colours.colours, colours.views, settings.bust.spacing_mm, atlas))
 
@@ -202,7 +202,7 @@ def push_out_hair(
     mesh = Mesh(shell.vertices_world, refined.mesh_world.faces)
     normals, depths, layout = mesh.normals(), depth_maps(rig, mesh), find_layout(context.model, settings)[0]
     around = None if layout is None else layout.around
-    colours = texture(mesh, coloured, views.silhouettes, rig, depths, settings=settings.texture, around=around)
+    colours = colour_vertices(mesh, coloured, views.silhouettes, rig, depths, settings=settings.texture, around=around)
     atlas = paint_head(layout, mesh, colours, context.model.levels["full"].face_region, settings)
     made = HairyHead(shell, normals, colours.colours, colours.views, atlas)
     beyond = shell.covered < MIN_COVERED

@@ -8,7 +8,7 @@ from jaxtyping import UInt8
 
 from pipeline.detail.dense_points import SurfacePoints, dense_points, skin_under_cap
 from pipeline.detail.depth_bias import OnFace, measure_bias, points_on_face
-from pipeline.imaging.highlights import without_highlights
+from pipeline.imaging.highlights import darken_highlights
 from pipeline.part_labels.votes import PartVotes, vote_parts
 from pipeline.settings import FINE_LEVELS, Settings
 from pipeline.stages.context import ReconstructionContext
@@ -45,7 +45,7 @@ def measure_depth(context: ReconstructionContext, views: Views, head: HeadFit, l
     maps: tuple[DepthMap, ...] = ()
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]] = views.capture.images
     if is_refined(head, settings) or settings.outputs.surface != "head":
-        images = without_highlights(images, views.silhouettes, context.rig, mesh)
+        images = darken_highlights(images, views.silhouettes, context.rig, mesh)
         maps = estimate_depth(
             images, views.silhouettes, context.rig, mesh, report=context.progress, device=context.device
         )

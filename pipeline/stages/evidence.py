@@ -9,7 +9,7 @@ from jaxtyping import Bool
 from pipeline.contour_fit.expression_evidence import doubtful_weights, makes_face
 from pipeline.contour_fit.fit import Fit
 from pipeline.detail.blink import blinks_of, with_lids
-from pipeline.detail.expression_reading import with_read_expression
+from pipeline.detail.expression_reading import read_expression
 from pipeline.detail.refine import DeformedSurface
 from pipeline.evidence.camera_metrics import CameraFigures, camera_figures, start_masks
 from pipeline.evidence.expression import (
@@ -121,7 +121,7 @@ def fit_with_read_face(
     )
     if not makes_face(fit.coefficients, model.posed):
         return with_lids(fit, model, lids), MIN_SIGMA, head.doubtful
-    read = with_read_expression(
+    read = read_expression(
         fit,
         model,
         context.model,

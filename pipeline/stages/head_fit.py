@@ -10,17 +10,17 @@ from typing import Literal
 from pipeline.contour_fit.bare_outline import (
     CapOutline,
     cells_of_views,
-    with_bare_outline,
-    with_counted_crown,
-    without_cap,
+    fit_bare_outline,
+    refit_with_crown,
+    shrink_cap_outlines,
 )
-from pipeline.contour_fit.contour import ContourSolution, finish, last_problem, solve_contour, with_span_misfit
-from pipeline.contour_fit.expression_evidence import doubtful_weights, with_expression_evidence
+from pipeline.contour_fit.contour import ContourSolution, add_span_misfit, finish, last_problem, solve_contour
+from pipeline.contour_fit.expression_evidence import doubtful_weights, solve_expressions
 from pipeline.contour_fit.fit import Fit
-from pipeline.contour_fit.posterior import RELIEF_OF_OUTLINES, with_estimated_prior
+from pipeline.contour_fit.posterior import RELIEF_OF_OUTLINES, estimate_prior
 from pipeline.head_model.gaussian_process import basis_of, model_basis
 from pipeline.head_model.model import HeadModel
-from pipeline.imaging.highlights import without_highlights
+from pipeline.imaging.highlights import darken_highlights
 from pipeline.part_labels.cap import Cap
 from pipeline.photometric_fit.patches import HairProbability
 from pipeline.photometric_fit.refine import FINE_AMPLITUDE_MM, refine_with_photographs
@@ -84,7 +84,7 @@ def fit_outlines(
     settings, rig = context.settings, context.rig
     bare = CapOutline(views.silhouettes, {})
     if cap is not None:
-        bare = without_cap(views.silhouettes, cap, rig, alignment.world_from_head.translation)
+        bare = shrink_cap_outlines(views.silhouettes, cap, rig, alignment.world_from_head.translation)
     model, features = model_basis(context.model, settings), views.capture.features
     start, seen, fitting, report = alignment.world_from_head, bare.silhouettes, settings.fitting, context.progress
     solved = solve_contour(
@@ -96,7 +96,7 @@ def fit_outlines(
         fit = fit_simplex(model, pose, seen, rig, fitting, renderer=context.renderer, report=report)
         return Staged(OutlineFit(fit, model, fitted_mesh(model, fit)))
     if cap is not None:
-        solved = with_counted_crown(solved, cells_of_views(bare.cells, solved.problem.views))
+        solved = refit_with_crown(solved, cells_of_views(bare.cells, solved.problem.views))
     state, model = solved.state, solved.problem.model
     vertices_world = state.world_from_head.apply(model.vertices(state.coefficients))
     return Staged(OutlineFit(solved, model, Mesh(vertices_world, model.levels["full"].faces)))
@@ -130,19 +130,19 @@ def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit,
     if settings.detail in PHOTO_LEVELS:
         hair = labels.hiding_probability()
         if labels.cap is None:
-            solved = with_bare_outline(solved, labels.skin_probability())
+            solved = fit_bare_outline(solved, labels.skin_probability())
             cranium = "hair" if solved.evidence.noise.bare is None else "bald"
-        images = without_highlights(views.capture.images, views.silhouettes, context.rig, outlines.mesh_world)
+        images = darken_highlights(views.capture.images, views.silhouettes, context.rig, outlines.mesh_world)
         solved, detail, doubtful = refine_with_likely_face(solved, images, hair)
     eigenheads, model = min(settings.fitting.modes, len(model.modes)), solved.problem.model
     relief_mm = FINE_AMPLITUDE_MM * (RELIEF_OF_OUTLINES if detail.level == "kernel" else 1.0)
     unlike = detail.reason.code == "level-alike-too-little"  # of 150 captures three, all turned by 3 to 13 degrees
     doubts = [compose("pose-doubtful", finding=compose("pose-unlike"))] if unlike else []
     if detail.level == "photo":
-        solved = with_expression_evidence(solved, eigenheads)
+        solved = solve_expressions(solved, eigenheads)
     if detail.level == "span":
         wider = basis_of(model, eigenheads, kernel=True)
-        fit = with_span_misfit(solved, wider, relief_mm=relief_mm)
+        fit = add_span_misfit(solved, wider, relief_mm=relief_mm)
         return Staged(HeadFit(fit, model, detail, cranium, doubtful, solved))
-    fit = with_estimated_prior(model, finish(solved), eigenheads, relief_mm=relief_mm)
+    fit = estimate_prior(model, finish(solved), eigenheads, relief_mm=relief_mm)
     return Staged(HeadFit(fit, model, detail, cranium, doubtful, solved), doubts)

@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.contour_fit.posterior import vertex_deviation_mm
-from pipeline.detail.depth_bias import without_window_bias
+from pipeline.detail.depth_bias import remove_window_bias
 from pipeline.detail.eyelids import measure_eye_appearance
 from pipeline.detail.outline_points import outline_search
 from pipeline.detail.patch_points import patch_search
 from pipeline.detail.refine import MIN_OBSERVED_SHARE, DeformedSurface, refine_to_surface
-from pipeline.fusion.untangling import untangled_head
+from pipeline.fusion.untangling import untangle_head
 from pipeline.photometric_fit.depth_search import head_depth_factor
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth, is_refined
@@ -48,12 +48,12 @@ def refine_head(
     settings, fit, model, mesh = context.settings, head.fit, head.model, head.mesh_world
     deviation_mm = vertex_deviation_mm(model, fit)
     if not is_refined(head, settings):
-        return Staged(RefinedHead(*untangled_head(model, mesh.vertices, deviation_mm), head.detail))
+        return Staged(RefinedHead(*untangle_head(model, mesh.vertices, deviation_mm), head.detail))
     distances = {name: views.silhouettes[name].distance for name, used in fit.used.items() if used}
     cameras, face = [context.rig[name] for name in distances], np.flatnonzero(model.levels["full"].face_region)
     factor = head_depth_factor(mesh, face, cameras)
     hair = labels.hiding_probability()
-    points = without_window_bias(depth.points, depth.on_face, depth.window_bias)
+    points = remove_window_bias(depth.points, depth.on_face, depth.window_bias)
     patches = patch_search(model, fit, depth.images, distances, hair, context.rig)
     displaced = refine_to_surface(
         fit,
@@ -69,7 +69,7 @@ def refine_head(
     share, needed = float(displaced.observed[model.levels["full"].face_region].mean()), MIN_OBSERVED_SHARE
     if share < needed:
         reason = compose("level-surface-too-small", share=share, needed=needed)
-        return Staged(RefinedHead(*untangled_head(model, mesh.vertices, deviation_mm), Detail("photo", reason)))
+        return Staged(RefinedHead(*untangle_head(model, mesh.vertices, deviation_mm), Detail("photo", reason)))
     detail = Detail("fine", compose("level-surface", share=share))
     refined = Mesh(displaced.vertices, mesh.faces)
     return Staged(RefinedHead(refined, displaced.deviation_mm, detail, displaced))

@@ -16,13 +16,13 @@ from pipeline.stages.recorder import Staged
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
 from pipeline.texturing.albedo import DIM_SHARE, Albedo, estimate_albedo
-from pipeline.texturing.chart_colours import ChartColours, chart_colours, with_true_colours
+from pipeline.texturing.chart_colours import ChartColours, correct_capture, measure_charts
 from pipeline.texturing.layout.normal_map import ReducedLayout, reduced_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.paint import find_layout, paint_head
 from pipeline.texturing.pores.skin_maps import COARSER, CloseViews, SkinMaps, read_close_views, skin_maps, skin_share
 from pipeline.texturing.sets.texture_sets import SetTextures, colour_by_sets
-from pipeline.texturing.vertex_colours import Shown, Texture, texture
+from pipeline.texturing.vertex_colours import Shown, Texture, colour_vertices
 from rig.capture import Capture
 from rig.mesh import Mesh
 from rig.messages.message import compose
@@ -50,11 +50,11 @@ def texture_head(
     """Colours the final head from the photographs, and paints its textures and maps."""
     settings, rig, model, mesh = context.settings, context.rig, head.model, refined.mesh_world
     normals, depths, face = mesh.normals(), depth_maps(rig, mesh), model.levels["full"].face_region
-    chart, warnings = chart_colours(views.capture, rig) if settings.texture.chart else (None, [])
-    capture = views.capture if chart is None else with_true_colours(views.capture, chart)
+    chart, warnings = measure_charts(views.capture, rig) if settings.texture.chart else (None, [])
+    capture = views.capture if chart is None else correct_capture(views.capture, chart)
     layout, of_layout = find_layout(model, settings)
     around = None if layout is None else layout.around
-    vertices = texture(
+    vertices = colour_vertices(
         mesh,
         capture,
         views.silhouettes,

@@ -93,7 +93,7 @@ def windowed_height(
     return height_mm
 
 
-def without_bias(mesh_world: Mesh, measured: Bool[np.ndarray, " v"], bias: WindowBias) -> Mesh:
+def subtract_bias(mesh_world: Mesh, measured: Bool[np.ndarray, " v"], bias: WindowBias) -> Mesh:
     """Subtracts the bias of window matching from the mesh's measured vertices, along their normals."""
     if bias == WindowBias():
         return mesh_world

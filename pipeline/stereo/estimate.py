@@ -351,13 +351,13 @@ def first_fields(matching: Matching, depth_ranges: Sequence[DepthRange]) -> list
         room, matcher = depth_ranges[view], matching.matcher(view)
         strides = label_strides(room)
         field = _cheapest(matcher.sweep(room, strides, LABELS), room, strides)
-        room = slanted(room, field, float(matching.stack.lens[view, 0]))
+        room = slant_bounds(room, field, float(matching.stack.lens[view, 0]))
         return _cheapest(matcher.sweep(room, strides, LABELS), room, strides)
 
     return map_in_threads(work, len(matching.stack))
 
 
-def slanted(room: DepthRange, field: Field, lens: float) -> DepthRange:
+def slant_bounds(room: DepthRange, field: Field, lens: float) -> DepthRange:
     """Replaces the slopes of the range's bounds by those of the depths around the pixel where the range is wider than
     ``WIDE_MM``. ``lens`` is the focal length in pixels."""
     live = field.depth > 0.0

@@ -72,7 +72,7 @@ def estimate_albedo(
     shading = 0.5 * (shading + least + np.hypot(shading - least, 0.5 * least))  # a maximum without a crease
     albedo = fill_unknown(matt / shading, seen, mesh_world.faces)
     factors = albedo / np.maximum(shown, 1e-4)
-    return Albedo(Atlas(atlas.layout, multiplied(atlas, factors)), light), []
+    return Albedo(Atlas(atlas.layout, multiply_texels(atlas, factors)), light), []
 
 
 def shine_left(
@@ -89,7 +89,7 @@ def shine_left(
     return np.clip(ratio / max(ordinary, 1e-4), 1.0 - MAX_SHINE, 1.0)
 
 
-def multiplied(atlas: Atlas, factors: Float[np.ndarray, "v 3"]) -> UInt8[np.ndarray, "s s 3"]:
+def multiply_texels(atlas: Atlas, factors: Float[np.ndarray, "v 3"]) -> UInt8[np.ndarray, "s s 3"]:
     """Returns the texture's image with each texel multiplied, in linear light, by the factors interpolated from the
     corners of the texel's triangle."""
     image, size = atlas.image, len(atlas.image)

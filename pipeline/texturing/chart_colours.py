@@ -44,7 +44,7 @@ class ChartColours:
         return np.mean([each.matrix for each in self.cameras.values()], axis=0)
 
 
-def chart_colours(capture: Capture, rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
+def measure_charts(capture: Capture, rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
     """Finds the charts in all clean plates, and computes the colour correction of each camera. Returns None and a
     warning if no plate shows a chart."""
     charts = map_in_threads(lambda k: charts_in(capture.backgrounds.get(rig.names[k], ())), len(rig))
@@ -62,20 +62,20 @@ def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[Char
     return ChartColours(cameras, mean / np.linalg.norm(mean)), []
 
 
-def with_true_colours(capture: Capture, colours: ChartColours) -> Capture:
+def correct_capture(capture: Capture, colours: ChartColours) -> Capture:
     """Returns the capture with the colours of its photographs and texture sets corrected; its clean plates are
     unchanged. A camera that saw no chart gets the mean correction."""
 
     def corrected(images: Mapping[str, ImageRgb]) -> dict[str, ImageRgb]:
         names = list(images)
-        pictures = map_in_threads(lambda k: in_true_colours(images[names[k]], colours.matrix_of(names[k])), len(names))
+        pictures = map_in_threads(lambda k: correct_picture(images[names[k]], colours.matrix_of(names[k])), len(names))
         return dict(zip(names, pictures, strict=True))
 
     sets = {name: corrected(images) for name, images in capture.texture_sets.items()}
     return replace(capture, images=corrected(capture.images), texture_sets=sets)
 
 
-def in_true_colours(
+def correct_picture(
     picture: UInt8[np.ndarray, "h w 3"], matrix: Float[np.ndarray, "3 3"]
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Returns a picture (sRGB) whose linear colours are multiplied by a camera's correction matrix and clipped to 0 to

@@ -47,7 +47,7 @@ from pipeline.texturing.view_selection_kernels import (
     propagate,
     ring_quality,
 )
-from pipeline.texturing.visibility import Decision, Sight, pack_pictures, see_points, see_weights, sharpened
+from pipeline.texturing.visibility import Decision, Sight, pack_pictures, see_points, see_weights, sharpen
 from pipeline.warnings import ReportWarning
 from rig.camera import Camera
 from rig.capture import Capture
@@ -172,7 +172,7 @@ class Shown:
 
 
 @traced
-def texture(
+def colour_vertices(
     mesh_world: Mesh,
     capture: Capture,
     silhouettes: Mapping[str, Silhouette],
@@ -201,7 +201,7 @@ def texture(
 
     def read_view(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
         silhouette = silhouettes[camera.name]
-        image = sharpened(capture.images[camera.name], silhouette.mask, settings.sharpening)
+        image = sharpen(capture.images[camera.name], silhouette.mask, settings.sharpening)
         return see_points(camera, image, silhouette, depths[camera.name], mesh_world.vertices, normals), image
 
     sights, images = zip(*map_in_threads(lambda k: read_view(views.cameras[k]), len(views)), strict=True)

@@ -95,7 +95,7 @@ def see_weights(
     )
 
 
-def sharpened(image: Photograph, inside: Bool[np.ndarray, "h w"], amount: float) -> Photograph:
+def sharpen(image: Photograph, inside: Bool[np.ndarray, "h w"], amount: float) -> Photograph:
     """Sharpens a photograph where it has detail. ``amount`` is the strength of the unsharp mask.
 
     Plain sharpening would amplify noise as well. The sharpening is therefore scaled as in a Wiener filter, by the

@@ -24,8 +24,8 @@ from pipeline.view_checks.camera_assignment import (
     ring_messages,
 )
 from pipeline.view_checks.guards import STRICT, Guards
-from pipeline.view_checks.mask_edges import TURNS, masks_alone_exchanged, turned_masks
-from pipeline.view_checks.rig_agreement import loose_outlines, wrong_rig
+from pipeline.view_checks.mask_edges import TURNS, find_turned_masks, masks_alone_exchanged
+from pipeline.view_checks.rig_agreement import explain_disagreement, loose_outlines
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture, Features, reassign_images, turn_masks
 from rig.errors import EigenheadError
@@ -100,7 +100,7 @@ def assign_images(
         overruled.append(guards.refuse(ExchangedPictures(exchange, doubtful=False)))
     capture = reassign_images(capture, plates=plates) if plates else capture
     silhouettes = segmented(capture)
-    turned = turned_masks(capture.images, silhouettes, capture.masks)
+    turned = find_turned_masks(capture.images, silhouettes, capture.masks)
     if turned:
         capture = turn_masks(capture, {name: TURNS[turn] for name, turn in turned.items()})
         silhouettes = segmented(capture)
@@ -139,7 +139,7 @@ def assign_images(
 
 def _check_rig(capture: Capture, rig: Rig, distinct: Mapping[str, Silhouette], guards: Guards) -> list[ReportWarning]:
     """Refuses the calibration of another rig, unless the face confirms the rig. Else returns warnings."""
-    wrong = wrong_rig(distinct, rig)
+    wrong = explain_disagreement(distinct, rig)
     if not wrong:
         return []
     face = guards.find_face(capture.images, rig)

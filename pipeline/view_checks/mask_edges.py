@@ -132,7 +132,7 @@ def masks_alone_exchanged(
     return after >= CLEAR and after > OWN_GAIN * before
 
 
-def turned_masks(
+def find_turned_masks(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], ready: Collection[str]
 ) -> dict[str, Message]:
     """Finds the supplied masks (cameras ``ready``) that follow their photograph only after a flip or a rotation, as

@@ -54,7 +54,7 @@ Pixels = Float[np.ndarray, "_ 2"]
 Turn = Callable[[Pixels, Intrinsics], Pixels]
 
 
-def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None:
+def explain_disagreement(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None:
     """Finds out why most cameras contradict each other: pictures are rotated or mirrored, the calibration has another
     convention or other lenses, or it belongs to another rig. Returns a message with the remedy; None if most cameras
     agree or only the masks are loose.
@@ -110,8 +110,8 @@ def _judged_misfit(hulls: Sequence[Pixels], rig: Rig) -> float:
 
 
 def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:
-    """Returns True if most outlines contradict the others because of loose masks. ``wrong_rig`` must have found no
-    fault."""
+    """Returns True if most outlines contradict the others because of loose masks, provided that
+    ``explain_disagreement`` finds no fault."""
     seen, hulls = outlined({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
     return len(seen) >= MIN_CAMERAS and _median_misfit(hulls, seen) >= MIN_WRONG
 

@@ -95,7 +95,7 @@ def usable_views(
     find_face = cache(lambda: guards.find_face(assigned.capture.images, rig))
     overruled: list[ReportWarning] = []
     doubted = [name for name, s in assigned.silhouettes.items() if s.quality.warnings or not s.quality.usable]
-    silhouettes = with_picture_faults(assigned.silhouettes, assigned.capture, doubted, rig)
+    silhouettes = replace_by_faults(assigned.silhouettes, assigned.capture, doubted, rig)
     usable = sum(s.quality.usable for s in silhouettes.values())
     by_face = MIN_VIEWS_OF_FACE <= usable < MIN_VIEWS <= len(silhouettes) and find_face() is not None
     if by_face:
@@ -109,9 +109,9 @@ def usable_views(
     left_out = usable - len(low) >= MIN_VIEWS
     silhouettes = {n: s.judged(usable=False) if left_out and n in low else s for n, s in silhouettes.items()}
     crowns = [compose("crown-low", camera=name, low_mm=mm) for name, mm in low.items()]
-    silhouettes, moved = without_moved_cameras(silhouettes, rig)
+    silhouettes, moved = exclude_moved_cameras(silhouettes, rig)
     unexplained = silhouettes
-    silhouettes = with_picture_faults(silhouettes, assigned.capture, moved.keys(), rig)
+    silhouettes = replace_by_faults(silhouettes, assigned.capture, moved.keys(), rig)
     moved_warnings = [warning for name, warning in moved.items() if silhouettes[name] is unexplained[name]]
     size = judge_head_size(silhouettes, rig, find_face, guards=guards, masks_given=bool(assigned.capture.masks))
     given_masks = [name for name in rig.names if name in assigned.capture.masks]
@@ -121,7 +121,7 @@ def usable_views(
     return UsableViews(assigned.capture, silhouettes, assigned.pictures, warnings)
 
 
-def without_moved_cameras(
+def exclude_moved_cameras(
     silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> tuple[dict[str, Silhouette], dict[str, ReportWarning]]:
     """Marks the views of cameras that moved since the calibration as not usable. The function also returns warnings by
@@ -184,7 +184,7 @@ MIN_LIGHT, MAX_LIGHT = 0.002, 0.98  # neither black nor burnt out
 MIN_PIXELS, MIN_COMPARED = 500, 3  # of a subject, and views, that tell anything
 
 
-def with_picture_faults(
+def replace_by_faults(
     silhouettes: Mapping[str, Silhouette], capture: Capture, suspects: Collection[str], rig: Rig
 ) -> dict[str, Silhouette]:
     """Replaces the warnings of each view in ``suspects`` by their cause, a fault of its picture. Views with a rotated

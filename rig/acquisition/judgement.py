@@ -167,7 +167,7 @@ def plate_faults(taken: Mapping[str, Sequence[ImageRgb]], live: Collection[str],
     return faults + [fault for fault in light if fault.is_error]
 
 
-def occupied(taken: Mapping[str, Sequence[ImageRgb]], before: Plates) -> list[Fault]:
+def find_occupied(taken: Mapping[str, Sequence[ImageRgb]], before: Plates) -> list[Fault]:
     """Returns a fault for each camera whose new plate differs from the plate in use in a region of a head's size.
     Returns no fault if the plates of less than the fraction ``SEEN_SHARE`` of all cameras differ."""
     compared = [name for name in taken if name in before and taken[name][0].shape == before.first[name].shape]

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rig.acquisition.judgement import PlatesRefused, examine, judge, occupied, plate_faults, size_faults
+from rig.acquisition.judgement import PlatesRefused, examine, find_occupied, judge, plate_faults, size_faults
 from rig.acquisition.plates import Plates, keep_plates, read_plates, use_plates, write_plates
 from rig.acquisition.shot import Fault, Shot, ShotFailed, Timing, certify
 from rig.acquisition.trigger import RigTrigger
@@ -154,7 +154,7 @@ class RigSession:
             if faults:
                 raise ShotFailed(faults)
             images = {name: tuple(images) for name, images in taken.items()}
-            if somebody := occupied(images, self.plates):
+            if somebody := find_occupied(images, self.plates):
                 version = keep_plates(self.config.plates_folder, images, tuple(fault.measured() for fault in somebody))
                 raise PlatesRefused(somebody, version)
             self.plates = write_plates(self.config.plates_folder, images)

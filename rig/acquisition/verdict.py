@@ -86,10 +86,10 @@ def view_faults(views: Mapping[str, ViewCheck], limits: ShotConfig) -> list[Faul
     """Returns the faults of a capture's pictures from the cameras' measurements."""
     pictures = {name: view.picture for name, view in views.items() if view.picture is not None}
     levels = {name: view.level for name, view in views.items() if view.level is not None}
-    return without_consequences([*judge_checks(pictures, levels, limits), *_place_faults(views)])
+    return remove_consequences([*judge_checks(pictures, levels, limits), *_place_faults(views)])
 
 
-def without_consequences(faults: Iterable[Fault]) -> list[Fault]:
+def remove_consequences(faults: Iterable[Fault]) -> list[Fault]:
     """Removes faults that another fault of the same camera explains. For example, a wrong background explains that no
     subject was found."""
     known = [*faults]

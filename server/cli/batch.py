@@ -219,7 +219,7 @@ class BatchProgress:
         return max([(mean_s * waiting + sum(begun)) / at_once, *begun])
 
 
-def told_time(seconds: float) -> str:
+def format_time(seconds: float) -> str:
     """Formats a duration in seconds, minutes or hours, rounded as an estimate."""
     if seconds < 90:
         return f"{seconds:.0f} s"
@@ -279,7 +279,7 @@ class BatchDisplay:
         if outcome.failure is not None:
             self._say(f"eigenhead: {outcome.name}: {outcome.failure.message}")
         elif self._bar is None and outcome.state == "made" and not QUIET.is_set():
-            ended, left = self._progress.ended, told_time(self._progress.remaining_s())
+            ended, left = self._progress.ended, format_time(self._progress.remaining_s())
             self._say(f"{ended} of {self._count}: {outcome.name} in {outcome.seconds:.0f} s, about {left} left")
 
     def seconds(self) -> float:
@@ -296,7 +296,7 @@ class BatchDisplay:
         progress = self._progress
         failed = f", {progress.failed} failed" if progress.failed else ""
         description = f"{progress.ended} of {self._count}{failed}"
-        left = f"about {told_time(progress.remaining_s())} left"
+        left = f"about {format_time(progress.remaining_s())} left"
         self._bar.update(self._task, description=description, completed=progress.share(), left=left)
 
     def _say(self, line: str) -> None:

@@ -47,7 +47,7 @@ def take(
     """Solve several captures of one person as one.
 
     Writes the neutral head with the person's own shapes, and the head of each capture."""
-    from pipeline.applications.moments.take import check_count, named
+    from pipeline.applications.moments.take import check_count, name_errors
     from pipeline.applications.moments.take_files import Shot, make_take, warning_lines
     from pipeline.settings import settings_from_document
     from server.cli.heads import capture_names, head_alone
@@ -69,7 +69,7 @@ def take(
         prepare_kernels(report, chosen)
         shots = {}
         for name, capture in zip(names, captures, strict=True):
-            with named(name):
+            with name_errors(name):
                 kept, folder = out / "moments" / name, stack.enter_context(folder_of(capture))
                 found = read_or_calibrate(folder, kept, front=chosen.front, report=report)
             shots[name] = Shot(found.capture, found.rig, partial(keep_masks, kept))

@@ -239,7 +239,7 @@ def photograph(who: Reader, job_id: str, camera: str) -> Response:
     name = _image_name(record, camera)
     stored = service.store.cache_of(record.id) / "straightened" / f"{Path(name).stem}.jpg"
     if not stored.is_file():
-        picture = straightened(read_image(capture / name), rig_of(capture)[camera])
+        picture = straighten(read_image(capture / name), rig_of(capture)[camera])
         write_image(stored, picture, quality=STRAIGHTENED_QUALITY)
     return FileResponse(stored, headers=FOREVER)
 
@@ -250,7 +250,7 @@ def faces_of_job(who: Reader, job_id: str) -> Response:
     capture, record = _capture_files(who[0], job_id)
     rig, faces_of = rig_of(capture), found_faces(who[0], record.id)["faces"]
     straight = {
-        name: [straightened_face(face, rig[name]) for face in detections] for name, detections in faces_of.items()
+        name: [straighten_face(face, rig[name]) for face in detections] for name, detections in faces_of.items()
     }
     return JSONResponse(straight, headers=FOREVER)
 
@@ -389,7 +389,7 @@ def rig_of(capture: Path) -> Rig:
     return read_rig_file(rig_file)
 
 
-def straightened(image: ImageRgb, camera: Camera) -> ImageRgb:
+def straighten(image: ImageRgb, camera: Camera) -> ImageRgb:
     """Removes the lens's distortion from a photograph and reduces it to at most ``WIDTH_MOST`` pixels of width."""
     lens = camera.intrinsics
     if camera.recorded is not None:
@@ -404,7 +404,7 @@ def straightened(image: ImageRgb, camera: Camera) -> ImageRgb:
     return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_AREA), np.uint8)
 
 
-def straightened_face(face: JsonObject, camera: Camera) -> JsonObject:
+def straighten_face(face: JsonObject, camera: Camera) -> JsonObject:
     """Converts a face to the pixels of the photograph without distortion, at full size. Points that the lens cannot
     image are left out."""
     lens, pixels = camera.intrinsics, np.array(face["points"])

@@ -26,7 +26,7 @@ from server.console.removal import removals
 from server.console.theme import Frame, page_frame
 from server.errors import Gone, InvalidInput
 from server.problem_types import type_of_failure
-from server.services.bulk import BulkOut, each
+from server.services.bulk import BulkOut, apply_each
 from server.services.health import readiness
 from server.services.keys import Caller
 from server.services.records import JobError
@@ -267,7 +267,7 @@ def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: M
     undoes the whole removal. Objects whose removal fails after the time to undo are logged."""
 
     def remove_each() -> None:
-        done = each(ids, remove)
+        done = apply_each(ids, remove)
         for one in done.refused:
             log.warning("not removed", id=one.id, error=one.detail.text)
 

@@ -27,7 +27,7 @@ class BulkOut(Answer):
     refused: list[RefusedOne]
 
 
-def each(ids: Iterable[str], action: Callable[[str], object]) -> BulkOut:
+def apply_each(ids: Iterable[str], action: Callable[[str], object]) -> BulkOut:
     """Calls ``action`` once for every different id and collects the results. A refusal for one id does not stop the
     others. Exceptions other than EigenheadError pass through."""
     done, refused = [], []

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 
 from rig.acquisition.face_sighting import face_remarks
 from rig.acquisition.shot import ShotDocument, read_fault
-from rig.acquisition.verdict import ViewDocument, verdict_of, without_consequences
+from rig.acquisition.verdict import ViewDocument, remove_consequences, verdict_of
 from rig.errors import InputError
 from rig.files import write_atomically
 from rig.formats.captures.archive import ArchiveLimits
@@ -295,7 +295,7 @@ class Captures:
         # Pictures of the simulated studio, whose shots have no checks, are judged like those of an upload.
         taken = cast(ShotDocument, shot) if shot is not None and "checks" in shot else None
         at_shot = [] if taken is None else [read_fault(document) for document in taken["faults"]]
-        faults = tuple(without_consequences([*at_shot, *content.faults]))
+        faults = tuple(remove_consequences([*at_shot, *content.faults]))
         checks = {} if taken is None else taken["checks"]
         of_views = {name: {**checks.get(name, {}), **view} for name, view in content.checks.items()}
         self._store.put_checks(folder, cast(dict[str, ViewDocument], of_views))

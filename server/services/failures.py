@@ -55,7 +55,7 @@ def _read_pickled(cls: DefaultSerializer, serialized_data: str) -> Any:
 DefaultSerializer.deserialize = _read_pickled
 
 
-def restored(error: Exception | None) -> JobFailed | None:
+def restore_failure(error: Exception | None) -> JobFailed | None:
     """Returns the JobFailed that the job engine kept as ``error``; None for any other error."""
     if isinstance(error, PortableWorkflowError) and error.name == JobFailed.__name__ and isinstance(error.data, dict):
         return JobFailed(**cast(dict[str, Any], error.data))
@@ -70,7 +70,7 @@ def failure(row: WorkflowStatus) -> JobError:
     """Returns why the job of a workflow's row failed. An error other than JobFailed is logged and becomes
     "internal-error"; a job that killed too many workers becomes "worker-died"."""
     error = row.error
-    if (failed := restored(error)) is not None:
+    if (failed := restore_failure(error)) is not None:
         return JobError(type=URN + failed.kind, detail=failed.detail, errors=failed.errors)
     if row.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED":
         return JobError(type=URN + "worker-died", detail=compose("worker-died"), errors=())

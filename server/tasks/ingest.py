@@ -135,7 +135,7 @@ def check_views(
     from pipeline.faces.subject import SearchEffort, find_subject
     from pipeline.segmentation.segment import segment
     from pipeline.settings import OutputSettings
-    from pipeline.texturing.chart_colours import chart_colours
+    from pipeline.texturing.chart_colours import measure_charts
     from pipeline.view_checks.guards import Guards
     from pipeline.view_checks.lens_distortion import judge_distortion
     from pipeline.view_checks.one_moment import judge_moments
@@ -151,7 +151,7 @@ def check_views(
     images, without_eyes = views.capture.images, SearchEffort(with_eyes=False)
     lenses = judge_distortion(images, views.silhouettes, rig)
     faces = find_subject(images, rig, networks, effort=without_eyes) if networks and chosen.faces.find else None
-    charts = chart_colours(shot, rig)[1] if chosen.texture.chart else ()
+    charts = measure_charts(shot, rig)[1] if chosen.texture.chart else ()
     return (*chosen.warnings, *views.warnings, *lenses, *judge_moments(faces, rig), *charts)
 
 

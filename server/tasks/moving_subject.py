@@ -26,7 +26,7 @@ from rig.mesh import Mesh
 from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
-from rig.studio.scene.simulate import View, view_cameras, view_light, worn_look
+from rig.studio.scene.simulate import View, change_appearance, view_cameras, view_light
 from rig.studio.scene.subject import Subject, dress, random_look
 from rig.studio.sensor.preset import Preset
 from rig.studio.sensor.sensor import drift, expose
@@ -108,7 +108,7 @@ class Film:
 
     def __init__(self, person: Person, rig: Rig, preset: Preset, renderer: Renderer) -> None:
         self.person, self.rig, self.preset, self.renderer = person, rig, preset, renderer
-        self._look = worn_look(random_look(np.random.default_rng((person.seed, 2))), preset, ())
+        self._look = change_appearance(random_look(np.random.default_rng((person.seed, 2))), preset, ())
         self._views: dict[str, View] = {}
 
     def light(self, pose: Pose) -> dict[str, View]:

@@ -98,9 +98,9 @@ def read_scaled_capture(folder: Path, *, pixels_most: int | None = WORK_PIXELS) 
     rig_file = find_rig_file(root)
     if rig_file is None or not has_known_length(root):
         return capture, rig
-    from calibration.scene.scale import scaled_by_length
+    from calibration.scene.scale import scale_by_length
 
-    scaled, remarks = scaled_by_length(capture, rig, read_rig_file(rig_file), read_scale(entry(root, SCALE), rig.names))
+    scaled, remarks = scale_by_length(capture, rig, read_rig_file(rig_file), read_scale(entry(root, SCALE), rig.names))
     if faults := rig_faults(scaled):
         raise InputError("capture", [f"{rig_file.name}, scaled by {SCALE}: {fault}" for fault in faults])
     return replace(capture, remarks=(*capture.remarks, *remarks)), scaled

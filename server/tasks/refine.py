@@ -13,7 +13,7 @@ from pipeline.segmentation.segment import segment
 from pipeline.settings import Settings
 from pipeline.stages.alignment import align_to_views
 from pipeline.stages.views import Views
-from pipeline.view_checks.usable_views import without_moved_cameras
+from pipeline.view_checks.usable_views import exclude_moved_cameras
 from rig.errors import InputError
 from rig.formats.cameras.cameras_json import read_rig
 from rig.geometry import Similarity
@@ -52,7 +52,7 @@ def refine_locally(
         if faults:
             raise InputError(path.name, [*faults, compose("captures-of-one-rig")])
         segmented = segment(capture, rig, report=discard_progress)
-        retained, warnings = without_moved_cameras(segmented, rig)
+        retained, warnings = exclude_moved_cameras(segmented, rig)
         silhouettes.append(retained)
         if head is not None:
             views = Views(capture, retained, {})

@@ -18,7 +18,7 @@ from rig.render.renderer import Renderer
 from rig.studio.devices.folder import simulate_to_folder
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import simulate
-from rig.studio.scene.subject import Subject, with_gaze
+from rig.studio.scene.subject import Subject, add_eyeballs
 from rig.studio.sensor.faults import fault_from_text
 from rig.studio.sensor.preset import Preset
 
@@ -77,7 +77,7 @@ class SubjectChoice:
 def turn_eyes(subject: Subject, gaze_deg: tuple[float, float] | None, seed: int) -> Subject:
     """Returns a subject with eyeballs that look along ``gaze_deg`` (azimuth and elevation) and whose colour ``seed``
     determines; without a gaze it returns the subject itself. Raises InputError for a head without landmarks."""
-    return subject if gaze_deg is None else with_gaze(subject, *gaze_deg, np.random.default_rng((seed, 1)))
+    return subject if gaze_deg is None else add_eyeballs(subject, *gaze_deg, np.random.default_rng((seed, 1)))
 
 
 def simulate_folder(

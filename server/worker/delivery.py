@@ -14,7 +14,7 @@ from rig.files import sha256_of
 from rig.messages.message import compose
 from server.errors import Refused
 from server.services.deliveries import DELIVER, MANIFEST, MANIFEST_FORMAT, delivery_id, place_of
-from server.services.failures import JobFailed, restored
+from server.services.failures import JobFailed, restore_failure
 from server.services.job_rows import request_of
 from server.services.results import Results
 from server.services.webhooks import Webhooks
@@ -55,7 +55,7 @@ class Deliverer:
                     if send(wanted):
                         deliverer.announce(wanted, "delivered")
                 except (JobFailed, PortableWorkflowError) as error:
-                    if (failed := restored(error)) is None:
+                    if (failed := restore_failure(error)) is None:
                         raise
                     log.warning("delivery failed", kind=failed.kind, detail=failed.detail.text)
                     deliverer.announce(wanted, "undelivered")

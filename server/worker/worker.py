@@ -46,7 +46,7 @@ from server.problem_types import type_of_failure
 from server.processes import process_identity, process_started
 from server.services import calibrations
 from server.services.deliveries import DELIVERIES_QUEUE, enqueue_delivery
-from server.services.failures import SERIALIZER, JobFailed, restored
+from server.services.failures import SERIALIZER, JobFailed, restore_failure
 from server.services.job_rows import APPLICATION, APPLICATION_VERSION, DELIVERY, WORKFLOW, request_of
 from server.services.results import Results
 from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
@@ -169,7 +169,7 @@ class Worker:
                     ingest(job_id, request)
                     files = publish(job_id, fit(job_id, request))
                 except (JobFailed, PortableWorkflowError) as error:
-                    if (failed := restored(error)) is None:
+                    if (failed := restore_failure(error)) is None:
                         raise
                     log.warning("job failed", kind=failed.kind, detail=failed.detail.text)
                     worker.outcomes.publish(job_id, "failed", request.get("webhook"), failure=failed.kind)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser
 
-from pipeline.applications.templates.animated import AnimatedMesh, animated_mesh
+from pipeline.applications.templates.animated import AnimatedMesh, animate_mesh
 from pipeline.applications.templates.write.writers import animated_scene
 from pipeline.evidence.expression import build_blendshape_rig
 from pipeline.head_model.expressions import VISEMES
@@ -48,7 +48,7 @@ def animated() -> tuple[AnimatedMesh, bytes]:
     faces, mean = model.levels["full"].faces, model.vertices(np.zeros(0))
     morphs = build_blendshape_rig(model, Similarity.identity(), Mesh(mean, faces), ()).morphs
     shapes, triangles = {name: morphs[name] for name in NAMES}, template.mesh.triangles()
-    made = animated_mesh(template.surface_binding, triangles, mean, faces, shapes, model.landmarks)
+    made = animate_mesh(template.surface_binding, triangles, mean, faces, shapes, model.landmarks)
     colours = np.full((len(made.neutral), 3), 180, np.uint8)
     return made, scene_glb_bytes(animated_scene(made, triangles, colours, {}))
 

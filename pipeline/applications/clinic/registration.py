@@ -25,7 +25,7 @@ from scipy.special import ndtri
 
 from pipeline.applications.clinic.anatomical_frame import frankfurt_axes
 from pipeline.applications.clinic.visit import Visit
-from pipeline.applications.model_building.correspondence.scans import read_landmarks, welded
+from pipeline.applications.model_building.correspondence.scans import read_landmarks, weld_scan
 from pipeline.applications.verification.reference import Reference
 from pipeline.geometry.registration.rigid import (
     ROUNDS,
@@ -204,7 +204,7 @@ class PatientSurface:
 def read_surface(path: Path, axes: Axes | None = None) -> PatientSurface:
     """Reads a CT surface from a .ply, .obj, .glb or .stl file. The CT axes are ``axes`` or, without them, those in the
     file's header (``SPACE=RAS``, as 3D Slicer writes it), else LPS. Raises InputError that lists every fault."""
-    mesh, _ = welded(read_mesh(path, SURFACE_ENDINGS))
+    mesh, _ = weld_scan(read_mesh(path, SURFACE_ENDINGS))
     data = path.read_bytes()
     found: Axes | None = next((stated for stated in AXES if f"SPACE={stated}".encode() in data[:HEADER_BYTES]), None)
     reference = Reference.of(mesh, {}, path.name, hashlib.sha256(data).hexdigest())

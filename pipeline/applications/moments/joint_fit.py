@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 from pipeline.applications.moments.arrow import Arrow
 from pipeline.compute.trace import traced
 from pipeline.contour_fit.contour import NON_MONOTONE, TOLERANCE, TRIES, ContourSolution, hold_at_bounds, last_problem
-from pipeline.contour_fit.expression_evidence import ROUNDS, estimated_variance, makes_face
+from pipeline.contour_fit.expression_evidence import ROUNDS, estimate_variance, makes_face
 from pipeline.contour_fit.head_problem import weight_bounds
 from pipeline.contour_fit.prior_term import LOG_SCALE, SCALE_SPREAD, weight_slope
 from pipeline.contour_fit.problem import POSE, State
@@ -232,7 +232,7 @@ def _with_evidence(
         step = arrow.least(whole, slope, *room)
         covariance = priors * arrow.variances(whole)
         for group in groups:
-            variance[group] = estimated_variance(identity + step[diagonal], covariance, variance, group)
+            variance[group] = estimate_variance(identity + step[diagonal], covariance, variance, group)
     return problem.after(states, step)
 
 

@@ -169,7 +169,7 @@ def _track_chunk(tracker: Tracker, pictures: Iterator[Pictures], frames: range, 
     found, shown, last = list[Tracked | None](), list[list[bool]](), list[Motion]()
     for number, taken in zip(frames, pictures, strict=False):  # takes no picture after the last frame
         report(f"frame {number + 1} of {count}", SHARE + (1.0 - SHARE) * number / count)
-        tracked = tracker.track(taken, moved_on(last)) if last else tracker.begin(taken)
+        tracked = tracker.track(taken, extrapolate_motion(last)) if last else tracker.begin(taken)
         found.append(tracked)
         shown.append([name in taken for name in tracker.person.rig.names])
         if tracked is not None:
@@ -188,7 +188,7 @@ def _track_chunk(tracker: Tracker, pictures: Iterator[Pictures], frames: range, 
     )
 
 
-def moved_on(last: list[Motion]) -> Motion:
+def extrapolate_motion(last: list[Motion]) -> Motion:
     """Extrapolates the head's motion from the last two frames; the head keeps the fraction ``KEPT`` of its speed."""
     if len(last) < 2:
         return last[-1]
@@ -198,7 +198,7 @@ def moved_on(last: list[Motion]) -> Motion:
     return replace(last[-1], world_from_head=RigidTransform(turn @ now.rotation, shift))
 
 
-def smoothed(course: Course) -> Course:
+def smooth_course(course: Course) -> Course:
     """Returns the course smoothed over time; failed frames get a pose and standard deviations by interpolation."""
     if course.failed.all():
         return course

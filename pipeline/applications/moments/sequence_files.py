@@ -27,7 +27,7 @@ from jaxtyping import Float, UInt8
 from pipeline.applications.moments.animated_glb import animated
 from pipeline.applications.moments.footage import Footage, open_footage
 from pipeline.applications.moments.point_cache import write_point_cache
-from pipeline.applications.moments.sequence import Course, smoothed, track_sequence, write_arrays
+from pipeline.applications.moments.sequence import Course, smooth_course, track_sequence, write_arrays
 from pipeline.applications.moments.sequence_person import Motion, SequencePerson
 from pipeline.applications.moments.track_frame import POSE
 from pipeline.geometry.projection import picture
@@ -73,7 +73,7 @@ def make_sequence(
         return None
     if course.failed.all():
         raise EigenheadError(compose("sequence-without-face"))
-    found = smoothed(course)
+    found = smooth_course(course)
     write_arrays(
         out / "sequence.npz",
         frames=np.array(footage.frames),

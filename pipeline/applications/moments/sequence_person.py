@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32
 
 from pipeline.applications.moments.footage import Footage
 from pipeline.applications.moments.joint_fit import fit_jointly
-from pipeline.applications.moments.take import named, solution_of
+from pipeline.applications.moments.take import name_errors, solution_of
 from pipeline.contour_fit.contour import ContourSolution
 from pipeline.estimation.bounded import least_within
 from pipeline.head_model.expressions import arkit_parts
@@ -68,7 +68,7 @@ def find_person(
     for done, key in enumerate(keys):
         report(done / (len(keys) + 1))
         try:
-            with named(footage.frames[key]), footage.capture(key) as (capture, rig):
+            with name_errors(footage.frames[key]), footage.capture(key) as (capture, rig):
                 context = ReconstructionContext(capture, rig, model, settings, renderer)
                 run = Recorder(context)
                 steps = start_reconstruction(context, run)

@@ -17,7 +17,7 @@ from pipeline.applications.moments.joint_fit import fit_jointly, joint_covarianc
 from pipeline.applications.moments.own_shapes import OwnShapes, estimate_own_shapes
 from pipeline.contour_fit.contour import ContourSolution
 from pipeline.contour_fit.fit import Fit
-from pipeline.contour_fit.posterior import RELIEF_OF_OUTLINES, with_estimated_prior
+from pipeline.contour_fit.posterior import RELIEF_OF_OUTLINES, estimate_prior
 from pipeline.head_model.model import HeadModel
 from pipeline.photometric_fit.refine import FINE_AMPLITUDE_MM
 from pipeline.reconstruct import start_reconstruction
@@ -88,7 +88,7 @@ def reconstruct_take(
     check_count(len(contexts))
     progress, fitted = _Advance(report, len(contexts)), dict[str, tuple[Generator[Any, HeadFit, None], HeadFit]]()
     for k, (name, context) in enumerate(contexts.items()):
-        with named(name):
+        with name_errors(name):
             steps = start_reconstruction(replace(context, progress=progress.of(name, k)))
             fitted[name] = steps, next(steps)
     alone = [solution_of(head) for _, head in fitted.values()]
@@ -99,7 +99,7 @@ def reconstruct_take(
     for solved, (name, covariance) in zip(joint, zip(contexts, joint_covariances(joint), strict=True), strict=True):
         steps, head = fitted.pop(name)
         apart = differ_by(head.fit, solved, eigenheads)
-        with named(name):
+        with name_errors(name):
             result = steps.send(joined(head, solved, covariance, eigenheads))
         moments.append(_moment(name, result, apart))
         deliver(name, result)
@@ -125,7 +125,7 @@ def joined(head: HeadFit, solved: ContourSolution, covariance: Float[np.ndarray,
     if level != "span":
         relief_mm = FINE_AMPLITUDE_MM * (RELIEF_OF_OUTLINES if level == "kernel" else 1.0)
         fit = replace(fit, misfit_mm=solved.misfit_mm)
-        fit = with_estimated_prior(head.model, fit, eigenheads, relief_mm=relief_mm)
+        fit = estimate_prior(head.model, fit, eigenheads, relief_mm=relief_mm)
     return replace(head, fit=fit, solution=None)
 
 
@@ -145,7 +145,7 @@ def solution_of(head: HeadFit) -> ContourSolution:
 
 
 @contextmanager
-def named(name: str) -> Iterator[None]:
+def name_errors(name: str) -> Iterator[None]:
     """Prefixes the messages of errors in the ``with`` block with the capture's name."""
     try:
         yield

@@ -27,9 +27,9 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.sparse.linalg import splu
 
 from pipeline.applications.templates.carrying import Attachment, SurfaceBinding, bind_vertices, frames
-from pipeline.applications.templates.contact import RestSurface, kept_apart, rest_surface
-from pipeline.applications.templates.eyeballs import STRAIGHT, Eyeball, lifted, placed_eyeballs
-from pipeline.applications.templates.inner_mouth import InnerMouth, kept_off_teeth, placed_inner_mouth
+from pipeline.applications.templates.contact import RestSurface, keep_apart, rest_surface
+from pipeline.applications.templates.eyeballs import STRAIGHT, Eyeball, lift_lids, place_eyeballs
+from pipeline.applications.templates.inner_mouth import InnerMouth, keep_off_teeth, place_inner_mouth
 from pipeline.applications.templates.pivots import EYE_REACH_MM, Points, in_mouth, jaw_motions, pivots
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.expressions import VISEMES, mixed
@@ -239,7 +239,7 @@ class AnimatedMesh:
     gazes: Mapping[str, Float[np.ndarray, " 3"]] = field(default_factory=dict)  # gazes of measured eyes, by pivot
 
 
-def animated_mesh(
+def animate_mesh(
     surface_binding: SurfaceBinding,
     triangles: Int[np.ndarray, "g 3"],
     vertices: Float[np.ndarray, "v 3"],
@@ -277,7 +277,7 @@ def animated_mesh(
     return _with_parts(bare, triangles, landmarks, jaw, loose)
 
 
-def animated_head(
+def animate_head(
     vertices: Float[np.ndarray, "v 3"],
     opened: Int[np.ndarray, "f 3"],
     shapes: Mapping[str, Float[np.ndarray, "v 3"]],
@@ -304,11 +304,11 @@ def _with_parts(
     """Returns the mesh with missing eyeballs, teeth and tongue, and with lids and lips corrected to avoid them."""
     mesh, shapes = bare.neutral, bare.shapes
     lacking = {name: at for name, at in bare.pivots.items() if name.startswith("eye_") and name not in bare.eyeballs}
-    added = placed_eyeballs(mesh, triangles, landmarks, lacking, bare.gazes)
+    added = place_eyeballs(mesh, triangles, landmarks, lacking, bare.gazes)
     if added:
-        shapes = {name: lifted(mesh, triangles, shape, added) for name, shape in shapes.items()}
-    inner = placed_inner_mouth(mesh, triangles, shapes, landmarks, jaw, loose)
-    shapes = kept_off_teeth(mesh, triangles, shapes, inner)
+        shapes = {name: lift_lids(mesh, triangles, shape, added) for name, shape in shapes.items()}
+    inner = place_inner_mouth(mesh, triangles, shapes, landmarks, jaw, loose)
+    shapes = keep_off_teeth(mesh, triangles, shapes, inner)
     centres = {name: eyeball.centre for name, eyeball in added.items()}
     return replace(bare, shapes=shapes, pivots={**bare.pivots, **centres}, added=added, inner=inner)
 
@@ -321,15 +321,15 @@ def parted_shapes(
     ``mouthClose`` closes a mouth that ``jawOpen`` has opened, and is corrected together with ``jawOpen``: by
     Apple's definition, lips cross if ``mouthClose`` is used alone."""
     out = {
-        name: kept_apart(rest, shape, closing=name.startswith(LIDS))
+        name: keep_apart(rest, shape, closing=name.startswith(LIDS))
         for name, shape in shapes.items()
         if name != "mouthClose"
     }
     if "mouthClose" in shapes:
         jaw = out.get("jawOpen", np.zeros_like(rest.vertices))
-        out["mouthClose"] = kept_apart(rest, jaw + shapes["mouthClose"], closing=False) - jaw
+        out["mouthClose"] = keep_apart(rest, jaw + shapes["mouthClose"], closing=False) - jaw
     out = {name: out[name] for name in shapes}
-    return out | {name: kept_apart(rest, mixed(out, mixture), closing=False) for name, mixture in VISEMES.items()}
+    return out | {name: keep_apart(rest, mixed(out, mixture), closing=False) for name, mixture in VISEMES.items()}
 
 
 def shut_lips(

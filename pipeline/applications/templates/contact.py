@@ -64,7 +64,7 @@ def crossings(rest: RestSurface, displacement: Vertices, weights: tuple[float, .
     return np.array([np.count_nonzero(_crossing(rest, displacement, w, moved)) for w in weights])
 
 
-def kept_apart(rest: RestSurface, displacement: Vertices, *, closing: bool) -> Vertices:
+def keep_apart(rest: RestSurface, displacement: Vertices, *, closing: bool) -> Vertices:
     """Returns a blendshape's displacement (mm, at weight 1) with the smallest change that leaves as few new crossings
     of triangles at ``WEIGHTS`` as possible. If ``closing``, the blendshape closes the lids, which stop where they meet;
     otherwise vertices on both sides of a crossing move together."""

@@ -109,7 +109,7 @@ def turn_to(gaze: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
     return rotation_from_vector(axis * (np.arctan2(sine, gaze @ AHEAD) / sine if sine > 0.0 else 1.0))
 
 
-def placed_eyeballs(
+def place_eyeballs(
     mesh: Places,
     triangles: Int[np.ndarray, "g 3"],
     landmarks: Points,
@@ -166,7 +166,7 @@ def _depths(eyeball: Eyeball, points: Float[np.ndarray, "g 7 3"]) -> Float[np.nd
     return np.maximum((reach + GAP_MM - distance).max(axis=1), 0.0)
 
 
-def lifted(
+def lift_lids(
     mesh: Places, triangles: Int[np.ndarray, "g 3"], displacement: Places, eyeballs: Mapping[str, Eyeball]
 ) -> Places:
     """Returns a blendshape's displacement (mm) with lids lifted off the eyeballs at ``WEIGHTS``, else unchanged."""

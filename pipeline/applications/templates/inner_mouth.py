@@ -100,7 +100,7 @@ def jaw_weight(shape: str, weight: float) -> float:
     return 0.0 if shape not in OPENED else 1.0 if shape == TONGUE_OUT else weight
 
 
-def placed_inner_mouth(
+def place_inner_mouth(
     mesh: Places,
     triangles: Int[np.ndarray, "g 3"],
     shapes: Shapes,
@@ -223,7 +223,7 @@ def _is_covered(mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes,
     return bool(((turned >= 0.0).all(axis=1) | (turned <= 0.0).all(axis=1)).any())
 
 
-def kept_off_teeth(
+def keep_off_teeth(
     mesh: Places, triangles: Int[np.ndarray, "g 3"], shapes: Shapes, inner: InnerMouth
 ) -> dict[str, Places]:
     """Returns blendshapes (mm) with lips lifted off the teeth at ``WEIGHTS``; all other vertices are unchanged."""

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.applications.model_building.correspondence.scans import landmark_file, read_landmarks, welded
+from pipeline.applications.model_building.correspondence.scans import landmark_file, read_landmarks, weld_scan
 from pipeline.geometry.surface_index import Hits, SurfaceIndex
 from rig.errors import InputError
 from rig.files import sha256_of
@@ -65,7 +65,7 @@ class Reference:
 def read_reference(path: Path, landmarks: Path | None = None) -> Reference:
     """Reads a scan with its landmarks: from the file ``landmarks`` or, if None, from a file of the same name beside the
     scan, if it exists. Raises InputError that lists every fault of the file."""
-    mesh, _ = welded(read_mesh(path))
+    mesh, _ = weld_scan(read_mesh(path))
     landmarks_path = landmarks or landmark_file(path)
     marks = {} if landmarks_path is None else read_landmarks(landmarks_path)
     return Reference.of(mesh, marks, path.name, sha256_of(path))

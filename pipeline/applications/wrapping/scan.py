@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from trimesh.remesh import subdivide
 
-from pipeline.applications.model_building.correspondence.scans import welded
+from pipeline.applications.model_building.correspondence.scans import weld_scan
 from rig.errors import InputError
 from rig.formats.meshes.mesh_file import TexturedMesh, read_textured_mesh
 from rig.image import ImageRgb
@@ -78,7 +78,7 @@ def read_raw_scan(path: Path) -> RawScan:
 
 def raw_scan(painted: TexturedMesh, name: str) -> RawScan:
     """Joins the mesh's vertices that lie at the same position, and removes degenerate triangles."""
-    mesh, (whole, proper) = painted.mesh, welded(painted.mesh)
+    mesh, (whole, proper) = painted.mesh, weld_scan(painted.mesh)
     return RawScan(name, whole, replace(painted, mesh=Mesh(mesh.vertices, mesh.faces[proper], mesh.colours)))
 
 

@@ -35,7 +35,7 @@ from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.networks import FaceNetworks, load_networks
 from pipeline.faces.points import RIGHT_EYE_OUTLINE, point_table
 from pipeline.faces.subject import find_subject
-from pipeline.fusion.untangling import topology_of, untangled
+from pipeline.fusion.untangling import topology_of, untangle
 from pipeline.geometry.registration.nonrigid import draw_to_matches
 from pipeline.geometry.registration.rigid import procrustes
 from pipeline.geometry.surface_index import Hits, SurfaceIndex
@@ -214,7 +214,7 @@ def _lids(face: MatchedFaces, rig: Rig) -> Float[np.ndarray, "32 3"] | None:
         return None
 
 
-def drawn_onto(
+def deform_onto(
     carried: Float[np.ndarray, "t 3"], template: Template, model: HeadModel, scan: Surface
 ) -> tuple[Float[np.ndarray, "t 3"], Bool[np.ndarray, " t"]]:
     """Deforms a template onto a nearby scan. Returns all vertices, and a mask of the vertices that lie on the scan.
@@ -249,7 +249,7 @@ def drawn_onto(
         return shape + along[:, None] * planes, weight
 
     drawn = draw_to_matches(start, faces, match, STIFFNESS)
-    drawn = untangled(drawn, topology_of(faces, len(drawn)))
+    drawn = untangle(drawn, topology_of(faces, len(drawn)))
     whole, met = np.zeros((len(parts), 3)), np.zeros(len(parts), bool)
     whole[rows], met[rows] = drawn, weight > 0.0
     out = binding.with_skin(whole[joined[binding.skin]])
@@ -423,7 +423,7 @@ def wrap(
     like = fit_model_to_mesh(with_expressions(model), surface, placed.marks, STAGES)
     carried = template.surface_binding.on(like.vertices, model.levels["full"].faces)
     report("drawing the template", 0.6)
-    drawn, met = drawn_onto(carried, template, model, surface)
+    drawn, met = deform_onto(carried, template, model, surface)
     _check(like, scan.name)
     report("measuring", 0.9)
     vertices = placed.head_from_scan.inverse().apply(drawn)

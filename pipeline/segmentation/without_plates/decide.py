@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.compute.threads import task_pool
-from pipeline.imaging.masks import dilated, eroded, spread, without_holes
+from pipeline.imaging.masks import dilate, erode, fill_holes, spread
 from pipeline.multiview.scene_tracks import ScenePoints, find_scene_points
 from pipeline.segmentation.background import COARSE_COLUMNS, Background, coarse_size, plate_tolerance
 from pipeline.segmentation.foreground import CONCLUSIVE, Decision, colours_apart, find_mixtures, whole_subject
@@ -71,7 +71,7 @@ def decide_without_plates(
     sizes = {name: image.shape[:2] for name, image in small.items()}
     points = find_scene_points(images, rig, report=partial(_between, report, 0.0, POINTS_SHARE))
     ball = viewing_ball(rig, None if head is None else head.centre_world)
-    plane = standing_plane(points.points, *ball)
+    plane = find_standing_plane(points.points, *ball)
     if plane is not None and head is not None and plane[:3] @ head.up_world < MIN_LEVEL:
         plane = None  # a patterned shirt is as flat as a table, but upright
     if plane is not None:
@@ -150,14 +150,14 @@ def decision_without_plate(
     mask, others = whole_subject(found.mask, found.odds < -1)
     odds = found.odds
     if solid:
-        holes = without_holes(mask) & ~mask
+        holes = fill_holes(mask) & ~mask
         mask, odds = mask | holes, np.where(holes, np.maximum(odds, SOLID_ODDS), odds)
-    outside = ~dilated(mask, MARGIN)
-    background = estimated_background(image, coarse, outside)
+    outside = ~dilate(mask, MARGIN)
+    background = guess_background(image, coarse, outside)
     tolerance = plate_tolerance(background.coarse)
     variance = (background.noise**2 / 4 + tolerance**2).astype(np.float32)
     away, mixture = find_mixtures(image, coarse, background)
-    paint = spread(coarse, eroded(mask, 1) * away / (1 + mixture**2), 2.0)
+    paint = spread(coarse, erode(mask, 1) * away / (1 + mixture**2), 2.0)
     clear = colours_apart(paint, background.coarse, variance) > CONCLUSIVE
     mixed = (mixture > 1) & (away > (2 * background.noise.mean(axis=2)) ** 2)
     probability = 1 / (1 + np.exp(-odds.astype(np.float64)))
@@ -165,7 +165,7 @@ def decision_without_plate(
     return Decision(coarse, background, odds, probability, mask, others, paint, odds, clear, plain, mixed)
 
 
-def estimated_background(
+def guess_background(
     image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], outside: Bool[np.ndarray, "h w"]
 ) -> Background:
     """Estimates the background behind the subject from the pixels ``outside``; its noise includes the estimate's
@@ -176,7 +176,7 @@ def estimated_background(
     behind = cv2.resize(guess, size, interpolation=cv2.INTER_LINEAR)
     seen = np.clip(2 * share[:, :, None] - 1, 0, 1)
     plate = np.rint(np.clip(seen * image + (1 - seen) * behind, 0, 255)).astype(np.uint8)
-    far = outside & ~dilated(~outside, 2)
+    far = outside & ~dilate(~outside, 2)
     test = spread(coarse, far.astype(np.float32), NEARBY_PX)
     ring = (outside & ~far).astype(np.float32)
     error = np.sqrt(spread((coarse - test) ** 2, ring, NOISE_WINDOW_PX))
@@ -195,7 +195,7 @@ def _pixel_noise(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, " 3"]
 
 def plate_noise(decision: Decision) -> float:
     """Returns the median noise (levels) of the estimated background along the subject's border; 0 without a border."""
-    rim = dilated(decision.mask, MARGIN) & ~eroded(decision.mask, MARGIN)
+    rim = dilate(decision.mask, MARGIN) & ~erode(decision.mask, MARGIN)
     return float(np.median(decision.background.noise[rim])) if rim.any() else 0.0
 
 
@@ -209,7 +209,7 @@ OUTLYING, ROOM = 0.01, 1.2  # share of points that are wrong; of their distance,
 MIN_OFF_CENTRE = 0.08  # of the radius: the place that all cameras look at is not on it
 
 
-def standing_plane(points_world: Float[np.ndarray, "n 3"], centre_world: Vector, radius_mm: float) -> Plane | None:
+def find_standing_plane(points_world: Float[np.ndarray, "n 3"], centre_world: Vector, radius_mm: float) -> Plane | None:
     """Finds the plane on which the subject stands: it contains many scene points, and hardly any lie behind it. ``plane
     . (x, 1)`` is the distance (mm), positive on the subject's side; None if no plane is found."""
     near = points_world[np.linalg.norm(points_world - centre_world, axis=1) < 2 * radius_mm]
@@ -296,7 +296,7 @@ def cut_along(image: UInt8[np.ndarray, "h w 3"], mask: Mask, bands: Bands) -> Fl
     """Segments the image in windows along the mask's outline. Returns, for each pixel, the weighted fraction of windows
     that assign it to the subject; a window has more weight near its middle."""
     height, width = mask.shape
-    inner, outer = eroded(mask, bands.inside), ~dilated(mask, bands.outside)
+    inner, outer = erode(mask, bands.inside), ~dilate(mask, bands.outside)
     side = min(WINDOW, height, width)
     row, column = np.mgrid[:side, :side] - (side - 1) / 2
     weight = np.exp(-(row**2 + column**2) / (2 * (side / 4) ** 2)).astype(np.float32)

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from scipy.ndimage import gaussian_filter
 
-from pipeline.imaging.masks import dilated, eroded, spread
+from pipeline.imaging.masks import dilate, erode, spread
 from pipeline.multiview.upright import guessed_up
 from pipeline.segmentation.mask_kernels import MAX_ODDS, mean_field_sweeps
 from pipeline.segmentation.without_plates.head_seed import HeadSeed, beside_head, head_core
@@ -166,11 +166,11 @@ def _with_neighbours(
 
 
 def _learn(found: CoarseMask, known: Mask, *, border: bool) -> Samples:
-    inner = eroded(found.mask, 1)
+    inner = erode(found.mask, 1)
     subject = inner if inner.any() else found.mask
     if border:
         return Samples(subject, known)
-    background = (~dilated(found.mask, 2) & (found.other_views.support < 0)) | (known & ~found.mask)
+    background = (~dilate(found.mask, 2) & (found.other_views.support < 0)) | (known & ~found.mask)
     return Samples(subject, background if background.sum() >= MIN_SAMPLES else known)
 
 

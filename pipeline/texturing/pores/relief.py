@@ -235,7 +235,7 @@ def log_light(codes: np.ndarray) -> Float32[np.ndarray, "r s"]:
     return np.log(np.maximum(LINEAR[codes] @ LUMINANCE, MIN_LIGHT) / LINEAR[EMPTY])
 
 
-def without_slow(light: Float32[np.ndarray, "r s"], side: int) -> Float32[np.ndarray, "r s"]:
+def remove_slow(light: Float32[np.ndarray, "r s"], side: int) -> Float32[np.ndarray, "r s"]:
     """Subtracts structures wider than a third of a patch, which would leak into all Fourier components.
 
     The wide Gaussian is computed on a downsampled strip, which takes a fiftieth of the time for a texture of 8192
@@ -273,7 +273,7 @@ def _row_of_patches(
     cuts = [slice(columns[k] + hop, columns[k] + hop + side) for k in which]
 
     def windowed(strip: np.ndarray) -> Float32[np.ndarray, "n q q"]:
-        band = without_slow(strip, side)
+        band = remove_slow(strip, side)
         return np.stack([band[:, cut] for cut in cuts]) * window
 
     shades = [windowed(strip) for strip in full]

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float16, Float32, Int32, UInt8, UInt16
 from pipeline.compute.threads import map_strips
 from pipeline.compute.trace import traced
 from pipeline.geometry.projection import project_points
-from pipeline.texturing.chart_colours import CODES, ENCODED, ChartColours, in_true_colours
+from pipeline.texturing.chart_colours import CODES, ENCODED, ChartColours, correct_picture
 from pipeline.texturing.layout.uv_unwrap import Atlas, ModelLayout
 from pipeline.texturing.light import fit_light, transfer
 from pipeline.texturing.paint_kernels import Choice, Pictures
@@ -79,7 +79,7 @@ def read_close_views(
         camera = decision.views.cameras[row]
         close, crop = _head_of(camera, read(sources.get(camera.name, camera.name)), mesh_world)
         cameras.append(close)
-        crops.append(crop if chart is None else in_true_colours(crop, chart.matrix_of(camera.name)))
+        crops.append(crop if chart is None else correct_picture(crop, chart.matrix_of(camera.name)))
     views = Rig(tuple(cameras))
     gains, offsets = (
         np.array([values.get(name, neutral) for name in views.names])
@@ -201,7 +201,7 @@ def skin_maps(
 
     map_strips(work, size, STRIP_ROWS)
     maps = SkinMaps(displacement, drawn, found.repeated, close.views.names)
-    return maps, sharpened_atlas(atlas, found.brightness)
+    return maps, sharpen_atlas(atlas, found.brightness)
 
 
 def codes_of(heights_mm: Float32[np.ndarray, "r s"]) -> UInt16[np.ndarray, "r s"]:
@@ -247,7 +247,7 @@ def skin_share(
     return total / np.maximum(weights, 1e-12)
 
 
-def sharpened_atlas(atlas: Atlas, brightness: Float16[np.ndarray, "s s"]) -> Atlas:
+def sharpen_atlas(atlas: Atlas, brightness: Float16[np.ndarray, "s s"]) -> Atlas:
     """Multiplies the linear light of a texture by the exponential of ``brightness``."""
     size = len(atlas.image)
     stored: UInt8[np.ndarray, "s s 3"] = np.empty((size, size, 3), np.uint8)  # blue first, as the painter's

@@ -22,7 +22,7 @@ from pipeline.texturing.neighbourhood import fill_unknown, level_views
 from pipeline.texturing.paint import paint_texture
 from pipeline.texturing.sets.specular import Specular, specular_light
 from pipeline.texturing.view_selection_kernels import OUTLIER, blend_views, sample_colours
-from pipeline.texturing.visibility import FOOTPRINT_PX, LINEAR, Decision, pack_pictures, sharpened
+from pipeline.texturing.visibility import FOOTPRINT_PX, LINEAR, Decision, pack_pictures, sharpen
 from pipeline.warnings import ReportWarning
 from rig.colour_space import srgb_from_linear
 from rig.image import ImageRgb
@@ -109,7 +109,7 @@ def set_texture(
 
     def read(k: int) -> tuple[UInt8[np.ndarray, "_ _ 3"], Float32[np.ndarray, "v 3"]]:
         name = views.names[k]
-        image = sharpened(images[name], silhouettes[name].mask, settings.sharpening)
+        image = sharpen(images[name], silhouettes[name].mask, settings.sharpening)
         pixels = project_points(views.cameras[k], mesh_world.vertices)
         return image, sample_colours(image, pixels, weights[k], LINEAR, FOOTPRINT_PX)
 

@@ -122,7 +122,7 @@ def _step(x: Float[np.ndarray, "r s"], middle: float, width: float) -> Float[np.
     return t * t * (3.0 - 2.0 * t)
 
 
-def opened(mesh: Mesh, landmarks: Landmarks) -> Mesh:
+def open_lids(mesh: Mesh, landmarks: Landmarks) -> Mesh:
     """Removes the skin between a head's lids (head frame), after subdividing triangles there, and gives the lids a
     thickness. The opened mesh's first vertices are those of ``mesh``. Eyes that are already open in the mesh keep their
     border."""

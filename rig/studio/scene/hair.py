@@ -108,7 +108,7 @@ def grow(vertices: Float[np.ndarray, "v 3"], body: Anatomy, style: HairStyle, rn
     points = np.stack([azimuth * 85.0, elevation * 90.0, np.zeros_like(azimuth)], axis=-1).reshape(-1, 3)
     shade = np.ones(len(shell))
     if style.curl_mm:
-        shell, shade = curled(shell, vertex_normals(shell, faces), style.curl_mm, grown.ravel(), rng)
+        shell, shade = add_curls(shell, vertex_normals(shell, faces), style.curl_mm, grown.ravel(), rng)
     along = shell[np.minimum(np.arange(len(shell)) + columns, len(shell) - 1)] - shell
     strands = grow_strands(shell, faces, along, np.cos(elevation.ravel()) * (grown.ravel() > 0.5), style, rng)
     return Hair(shell, faces, points, shade, *strands)
@@ -195,7 +195,7 @@ def grow_strands(
     return vertices, ribbons.reshape(-1, 3), points.reshape(-1, 3), np.repeat(root, 2 * STRAND_POINTS)
 
 
-def curled(
+def add_curls(
     vertices: Vertices, normals: Vertices, curl_mm: float, amount: Float[np.ndarray, " v"], rng: np.random.Generator
 ) -> tuple[Vertices, Float[np.ndarray, " v"]]:
     """Adds curls to a surface of hair as ridges along the zeros of a random field. Returns the new vertices, and each
@@ -232,7 +232,7 @@ def grow_beard(head: Mesh, body: Anatomy, style: HairStyle, rng: np.random.Gener
     chin = np.exp(-((head.vertices[:, 1] - body.chin_y) ** 2) / (2 * 26.0**2))
     height = share * style.thickness_mm * (0.45 + 0.55 * chin) - SUNK_MM * (1.0 - np.clip(4.0 * share, 0.0, 1.0))
     vertices = head.vertices + height[:, None] * outward
-    vertices, shade = curled(vertices, normals, style.curl_mm, np.clip(2.0 * share, 0.0, 1.0), rng)
+    vertices, shade = add_curls(vertices, normals, style.curl_mm, np.clip(2.0 * share, 0.0, 1.0), rng)
     along = 3.0 * (np.array([0.0, -1.0, 0.15]) + 0.3 * normals)
     strands = grow_strands(vertices, faces, along, (share > 0.3).astype(float), style, rng)
     return Hair(vertices, faces, vertices * (1.0, 0.4, 1.0), shade, *strands)
@@ -292,7 +292,7 @@ def hang(shell: Hair, below: Points, body: Anatomy, style: HairStyle, rng: np.ra
     points = np.stack([np.tile(angle * 85.0, (SHEET_ROWS, 1)), drop, np.zeros_like(drop)], axis=-1).reshape(-1, 3)
     shade = 1.0 - 0.25 * np.tile(edge, (SHEET_ROWS, 1)).ravel()
     if style.curl_mm:
-        vertices, curl_shade = curled(
+        vertices, curl_shade = add_curls(
             vertices, vertex_normals(vertices, faces), style.curl_mm, np.ones(sheet[..., 0].size), rng
         )
         shade = shade * curl_shade

@@ -24,11 +24,11 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.eyes import Eye
 from rig.studio.scene.lights import LAMPS, Lamp
-from rig.studio.scene.subject import Look, Subject, dress, random_look, random_pose, restyled
+from rig.studio.scene.subject import Look, Subject, dress, random_look, random_pose, restyle
 from rig.studio.scene.visible import VisiblePoints, part_masks, visible_points
 from rig.studio.sensor.faults import Fault
 from rig.studio.sensor.preset import Preset
-from rig.studio.sensor.sensor import Sensor, drift, expose, focus, rolled, smooth
+from rig.studio.sensor.sensor import Sensor, drift, expose, focus, roll_shutter, smooth
 
 Vector = Float[np.ndarray, " 3"]
 Plane = Float[np.ndarray, "h w"]
@@ -188,7 +188,7 @@ def build_scene(
     """Dresses, lights and renders the subject, and draws the backdrops. Skin, hair and backdrops depend on ``rng``, but
     not on pose and lamps."""
     look_rng, pose_rng, dress_rng, set_rng = rng.spawn(4)
-    look = worn_look(look or random_look(look_rng), preset, faults)
+    look = change_appearance(look or random_look(look_rng), preset, faults)
     pose = world_from_head or random_pose(rig.centre_world(), preset.pose_spread_deg, preset.pose_spread_mm, pose_rng)
     dressed = dress(renderer, subject, look, pose, clothes=preset.clothes, rng=dress_rng, lamps=lamps)
     true_rig = Rig(tuple(_knocked(camera, faults, set_rng) for camera in rig))
@@ -297,9 +297,9 @@ def _settled(fault: Fault, rig: Rig, rng: np.random.Generator) -> Fault:
     return replace(fault, camera=drawn) if alone and fault.camera is None else fault
 
 
-def worn_look(look: Look, preset: Preset, faults: Sequence[Fault]) -> Look:
+def change_appearance(look: Look, preset: Preset, faults: Sequence[Fault]) -> Look:
     """Applies the changes of the preset and the faults to a subject's appearance."""
-    look = replace(restyled(look, preset.hairstyle), pores=preset.pores, oil=preset.oil)
+    look = replace(restyle(look, preset.hairstyle), pores=preset.pores, oil=preset.oil)
     look = replace(look, scattering_mm=preset.scattering_mm)
     if not preset.hair:
         look = replace(look, hair=None, beard=None)
@@ -332,7 +332,7 @@ def _rolling(
     true position. All parts of the subject move like the head's origin, although parts nearer to the camera should move
     by a tenth more."""
     shifts = {camera.name: camera.project_with_jacobian(at_world[None])[1][0] @ sway_mm for camera in rig}
-    return {name: rolled(light[name], shifts[name]) for name in light}
+    return {name: roll_shutter(light[name], shifts[name]) for name in light}
 
 
 def view_cameras(

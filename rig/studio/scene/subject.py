@@ -16,7 +16,7 @@ from rig.messages.message import compose
 from rig.render.photograph import NOISE_CELLS, Gallery, Grain, Part
 from rig.render.renderer import Renderer
 from rig.studio.scene.anatomy import Anatomy, Landmarks, anatomy
-from rig.studio.scene.eyes import IRIS_TONES, Eye, eye_centres, look_at_point, opened, surface
+from rig.studio.scene.eyes import IRIS_TONES, Eye, eye_centres, look_at_point, open_lids, surface
 from rig.studio.scene.hair import STRAND_POINTS, Hair, HairStyle, grow, grow_beard, hang, knot
 from rig.studio.scene.lights import LAMPS, Lamp, irradiance, lamp_directions
 from rig.studio.scene.skin_texture import oily_zones, skin_paint
@@ -26,7 +26,7 @@ from rig.studio.sensor.sensor import volume
 Vertices = Float[np.ndarray, "v 3"]
 
 
-def scattered(
+def scatter_light(
     vertices: Vertices, faces: Int[np.ndarray, "f 3"], irradiance: Vertices, scattering_mm: tuple[float, float, float]
 ) -> Vertices:
     """Simulates scattering of light within the skin, by one implicit step of heat flow on the surface for each channel.
@@ -163,7 +163,7 @@ class Dressed:
     surfaces: Mapping[str, Mesh]
 
 
-def with_gaze(subject: Subject, azimuth_deg: float, elevation_deg: float, rng: np.random.Generator) -> Subject:
+def add_eyeballs(subject: Subject, azimuth_deg: float, elevation_deg: float, rng: np.random.Generator) -> Subject:
     """Adds eyeballs of a random colour to a subject, directed at a point ``GAZE_MM`` away. The gaze is relative to
     straight ahead: azimuth to the subject's left, elevation upwards. Raises InputError for a head without landmarks."""
     marks = anatomy(subject.mesh.vertices, subject.landmarks).landmarks
@@ -217,7 +217,7 @@ def dress(
     head, body = subject.mesh, anatomy(subject.mesh.vertices, subject.landmarks)
     worn = shirt(head, body, cloth_rng) if clothes else None
     hairs = _hairs(head, body, appearance, worn, hair_rng)
-    pierced = replace(subject, mesh=opened(head, body.landmarks)) if subject.eyes else subject
+    pierced = replace(subject, mesh=open_lids(head, body.landmarks)) if subject.eyes else subject
     pieces = [_skin(pierced, body, appearance, worn is not None, skin_rng)]  # a shirt hides the cut through the neck
     pieces += [_hair_piece(hair, style) for hair, style in hairs]
     if worn:
@@ -233,7 +233,7 @@ def dress(
     solid = joined(placed)
     light = irradiance(renderer, [(v, n) for (v, _), n in zip(placed, normals, strict=True)], solid, lamps)
     if max(appearance.scattering_mm) > 0.0:
-        light[0] = scattered(*placed[0], light[0], appearance.scattering_mm)
+        light[0] = scatter_light(*placed[0], light[0], appearance.scattering_mm)
     parts = [
         Part(vertices, faces, normal, piece.places, piece.paint, lit, piece.grain, piece.one_sided, piece.oil)
         for piece, (vertices, faces), normal, lit in zip(pieces, placed, normals, light, strict=True)
@@ -408,7 +408,7 @@ HAIRSTYLES: Mapping[str, Change] = MappingProxyType({
 without panes: the pipeline asks studios for that."""
 
 
-def restyled(appearance: Look, names: Sequence[str]) -> Look:
+def restyle(appearance: Look, names: Sequence[str]) -> Look:
     """Applies the changes ``names`` of ``HAIRSTYLES`` to an appearance. Raises InputError for an unknown name."""
     if unknown := [name for name in names if name not in HAIRSTYLES]:
         raise InputError("hair", [compose("none-of", value=name, known=[*HAIRSTYLES]) for name in unknown])

@@ -42,7 +42,7 @@ def focus(linear: Float[np.ndarray, "h w 3"], sensor: Sensor) -> Float[np.ndarra
     return light * fall_off[:, :, None] * np.array(sensor.gains, np.float32)
 
 
-def rolled(subject: Float[np.ndarray, "h w 4"], shift_px: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "h w 4"]:
+def roll_shutter(subject: Float[np.ndarray, "h w 4"], shift_px: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "h w 4"]:
     """Returns the subject's image by a rolling shutter while the subject moves. ``shift_px`` is the motion between the
     readouts of the first and the last row. The picture's middle row shows the true position."""
     height, width = subject.shape[:2]
@@ -64,7 +64,7 @@ def expose(light: Float[np.ndarray, "h w 3"], sensor: Sensor, rng: np.random.Gen
         light = through_mosaic(light)
     step = np.sqrt(np.clip(light, 0.0, 1.0)) * np.float32(CURVE_STEPS - 1) + np.float32(0.5)
     picture = _CURVE[step.astype(np.uint16)]
-    return picture if sensor.preset.jpeg_quality is None else compressed(picture, sensor.preset.jpeg_quality)
+    return picture if sensor.preset.jpeg_quality is None else compress_jpeg(picture, sensor.preset.jpeg_quality)
 
 
 def through_mosaic(light: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
@@ -77,7 +77,7 @@ def through_mosaic(light: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 
     return filled.astype(np.float32) / np.float32(65535.0)
 
 
-def compressed(picture: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.ndarray, "h w 3"]:
+def compress_jpeg(picture: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.ndarray, "h w 3"]:
     """Compresses a picture as JPEG with colour at half resolution, and decodes it again."""
     flags = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
     data = cv2.imencode(".jpg", np.ascontiguousarray(picture[:, :, ::-1]), flags)[1]

@@ -15,7 +15,7 @@ from server.console.identity import permit
 from server.console.page import Action, Page, remove_all_later, remove_later, said_unless_refused, serve_page, shared
 from server.console.removal import removals
 from server.errors import NotFound
-from server.services.bulk import each
+from server.services.bulk import apply_each
 from server.services.records import SessionOut
 from server.services.service import Service
 from server.services.templates import templates_at_hand
@@ -280,20 +280,20 @@ def bulk(page: Page, event: JsonObject) -> Message | None:
         permit(page.caller, "submit")
         work = chosen_work(event)
         jobs: list[str] = []
-        done = each(ids, lambda capture: jobs.append(service.jobs.submit(capture, work, key=page.caller.key).id))
+        done = apply_each(ids, lambda capture: jobs.append(service.jobs.submit(capture, work, key=page.caller.key).id))
         page.started(*jobs)
     elif action == "move":
-        done = each(ids, lambda capture: service.captures.edit(capture, {"session": event["id"] or None}))
+        done = apply_each(ids, lambda capture: service.captures.edit(capture, {"session": event["id"] or None}))
     elif action in ("tag", "untag"):
         tags, change = typed_tags(event.get("tags", "")), service.captures.tag
         if action == "untag":
             change = service.captures.untag
-        done = each(ids, lambda capture: change(capture, tags))
+        done = apply_each(ids, lambda capture: change(capture, tags))
     elif action == "erase":
         permit(page.caller, "erase")
-        done = each(ids, service.captures.erase)
+        done = apply_each(ids, service.captures.erase)
     else:
-        done = each(ids, service.captures.check_unused)
+        done = apply_each(ids, service.captures.check_unused)
         heads = sum(len(service.captures.holdings(capture).heads) for capture in done.done)
         title = compose("captures-pictures", count=len(done.done))
         if heads:

@@ -20,7 +20,7 @@ from server.console.page import (
 from server.console.pages.rig import read_report
 from server.console.removal import removals
 from server.errors import Conflict
-from server.services.bulk import each
+from server.services.bulk import apply_each
 from server.services.job_rows import FINISHED, STATUSES
 from server.services.records import JobOut
 from server.services.retention import ENDED
@@ -181,7 +181,7 @@ def bulk(page: Page, event: JsonObject) -> Message:
         "cancel": service.cancel,
         "restart": lambda job: begun.append(service.jobs.restart(job, restarted, key=page.caller.key).id),
     }
-    done = each(event["ids"], actions[action])
+    done = apply_each(event["ids"], actions[action])
     page.started(*begun)
     shared.forget("jobs")
     count = len(done.done)

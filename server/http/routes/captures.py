@@ -28,7 +28,7 @@ from server.http.schemas import (
     Sought,
     WithTag,
 )
-from server.services.bulk import BulkOut, each
+from server.services.bulk import BulkOut, apply_each
 from server.services.captures import CaptureMetadata
 from server.services.erasure import HoldingsOut
 from server.services.records import JobOut
@@ -129,7 +129,7 @@ def change_captures(service: ServiceOf, caller: Taker, wanted: CaptureBulk) -> B
         "tag": lambda capture: service.captures.tag(capture, wanted.tags),
         "untag": lambda capture: service.captures.untag(capture, wanted.tags),
     }
-    return each(wanted.ids, actions[wanted.action])
+    return apply_each(wanted.ids, actions[wanted.action])
 
 
 @router.get("/captures/{capture_id}", responses=documented(404))

@@ -31,7 +31,7 @@ from server.http.schemas import (
     Sought,
 )
 from server.services.answer import State
-from server.services.bulk import BulkOut, each
+from server.services.bulk import BulkOut, apply_each
 from server.services.job_rows import FINISHED, STATUSES
 from server.services.records import JobOut
 from server.services.work import ReconstructionRequest
@@ -105,7 +105,7 @@ def change_jobs(service: ServiceOf, caller: Submitter, wanted: JobBulk) -> BulkO
         "restart": lambda job: service.jobs.restart(job, ReconstructionRequest(), key=caller.key),
         "remove": service.jobs.delete,
     }
-    return each(wanted.ids, actions[wanted.action])
+    return apply_each(wanted.ids, actions[wanted.action])
 
 
 @router.get("/jobs/{job_id}", responses=documented(404))

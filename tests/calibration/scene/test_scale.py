@@ -13,13 +13,13 @@ from calibration.scene.scale import (
     FACE_SHARE,
     find_scale,
     find_tags,
+    scale_by_length,
     scale_from_face,
     scale_from_head,
     scale_from_tags,
-    scaled_by_length,
     times,
 )
-from calibration.scene.scene import transformed
+from calibration.scene.scene import transform_structure
 from calibration.scene.structure import Structure
 from rig.camera import Camera
 from rig.capture import Capture
@@ -40,7 +40,7 @@ def structure(points: np.ndarray) -> Structure:
     seen = np.concatenate([camera.project(points) for camera in rig])
     order = np.arange(len(points))
     whole = Structure(rig, points, np.repeat(np.arange(len(rig)), len(points)), np.tile(order, len(rig)), seen, True)
-    return transformed(whole, rig, UNIT)
+    return transform_structure(whole, rig, UNIT)
 
 
 @pytest.fixture
@@ -147,7 +147,7 @@ def test_the_length_makes_the_rig_millimetres(factor: float, known: PointDistanc
     free = times(RIG, factor)
     assert factor != 0.01 or rig_faults(free)
     assert not rig_faults(free, any_unit=True)
-    scaled, (remark,) = scaled_by_length(BLANK, free, free, known)
+    scaled, (remark,) = scale_by_length(BLANK, free, free, known)
     assert remark.code == "cameras-scaled"
     for camera, true in zip(scaled, RIG, strict=True):
         np.testing.assert_allclose(camera.centre_world, true.centre_world, rtol=1e-3, atol=1e-3)
@@ -157,17 +157,17 @@ def test_the_length_makes_the_rig_millimetres(factor: float, known: PointDistanc
 def test_a_printed_tag_does() -> None:
     free = times(RIG, 2.0)
     views = Capture({camera.name: tagged(camera, 40.0) for camera in RIG.cameras[:4]})
-    scaled, remarks = scaled_by_length(views, free, free, TagSize("DICT_4X4_50", 40.0))
+    scaled, remarks = scale_by_length(views, free, free, TagSize("DICT_4X4_50", 40.0))
     assert len(remarks) == 1
     ratio = np.linalg.norm(scaled.cameras[0].centre_world) / np.linalg.norm(RIG.cameras[0].centre_world)
     assert ratio == pytest.approx(1.0, abs=0.01)
     with pytest.raises(InputError, match="no tag of it was found"):
-        scaled_by_length(views, free, free, TagSize("DICT_5X5_50", 40.0))
+        scale_by_length(views, free, free, TagSize("DICT_5X5_50", 40.0))
 
 
 def test_cameras_that_agree_with_the_length_stay_and_covariances_grow_with_the_rig() -> None:
     near = times(RIG, 1.001)
-    same, remarks = scaled_by_length(BLANK, near, near, cameras())
+    same, remarks = scale_by_length(BLANK, near, near, cameras())
     assert (same.cameras, remarks) == (near.cameras, [])
     camera = RIG.cameras[0]
     before = np.diag([1e-6, 1e-6, 1e-6, 0.1, 0.1, 0.1])

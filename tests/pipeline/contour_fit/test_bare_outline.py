@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.contour_fit.bare_outline import bare_cells, with_bare_outline
+from pipeline.contour_fit.bare_outline import fit_bare_outline, mark_bare_cells
 from pipeline.contour_fit.clutter import CELL_PX
 from pipeline.contour_fit.contour import ContourSolution, solve_contour
 from pipeline.head_model.gaussian_process import with_kernel
@@ -37,19 +37,19 @@ def at_outline(cells: np.ndarray) -> np.ndarray:
 
 def test_smooth_skin_is_a_skull_and_hair_as_light_as_skin_is_none() -> None:
     light = np.ones((SIZE, SIZE), np.float32)
-    cells = bare_cells(ball(), light, PX_PER_MM)
+    cells = mark_bare_cells(ball(), light, PX_PER_MM)
     assert at_outline(cells).all()
     assert not cells[MIDDLE // CELL_PX, MIDDLE // CELL_PX]  # far from any outline
-    assert not at_outline(bare_cells(ball(tufts_mm=2.5), light, PX_PER_MM)).any()
+    assert not at_outline(mark_bare_cells(ball(tufts_mm=2.5), light, PX_PER_MM)).any()
     no_subject = signed_distance(np.zeros((SIZE, SIZE), bool))
-    assert not bare_cells(no_subject, light, PX_PER_MM).any()
+    assert not mark_bare_cells(no_subject, light, PX_PER_MM).any()
 
 
 def test_smooth_hair_is_no_skull() -> None:
     """Only the lower half is skin: no cell well above its end is a skull's."""
     skin = np.zeros((SIZE, SIZE), np.float32)
     skin[MIDDLE:] = 1.0
-    cells = bare_cells(ball(), skin, PX_PER_MM)
+    cells = mark_bare_cells(ball(), skin, PX_PER_MM)
     assert not cells[: (MIDDLE - 20) // CELL_PX].any()
     assert cells[(MIDDLE + 40) // CELL_PX :].any()
 
@@ -91,10 +91,10 @@ def test_a_bare_crown_that_no_eigenhead_has_is_followed(model, tower) -> None:
     solved = solve(model, rig, silhouettes)
     true_mm = truth[:, 1].max()
     assert top_mm(model, solved) < true_mm - 8.0  # the outlines alone take it for hair
-    bare = with_bare_outline(solved, everywhere(silhouettes, 1.0))
+    bare = fit_bare_outline(solved, everywhere(silhouettes, 1.0))
     assert abs(top_mm(model, bare) - true_mm) < 1.0
-    assert with_bare_outline(solved, everywhere(silhouettes, 0.0)) is solved  # hair as smooth as a skull
-    assert with_bare_outline(solved, {}) is solved
+    assert fit_bare_outline(solved, everywhere(silhouettes, 0.0)) is solved  # hair as smooth as a skull
+    assert fit_bare_outline(solved, {}) is solved
 
 
 @pytest.mark.gl
@@ -106,4 +106,4 @@ def test_tufts_of_the_colour_of_skin_do_not_pull(model, tower) -> None:
     waves = (1.5 * np.sin(row / 3.0) * np.cos(column / 3.0)).astype(np.float32).ravel()  # px, 0.7 mm
     tufted = replace(views, distance=views.distance + np.tile(waves, len(views.names)))
     solved = replace(solved, problem=replace(solved.problem, views=tufted))
-    assert with_bare_outline(solved, everywhere(silhouettes, 1.0)) is solved
+    assert fit_bare_outline(solved, everywhere(silhouettes, 1.0)) is solved

@@ -7,9 +7,9 @@ import pytest
 
 from pipeline.contour_fit.contour import schedule
 from pipeline.contour_fit.head_problem import head_problem
-from pipeline.contour_fit.noise_model import estimated_unit
+from pipeline.contour_fit.noise_model import estimate_unit
 from pipeline.contour_fit.posterior import vertex_deviation_mm
-from pipeline.contour_fit.problem import PER_CAMERA, State, first_evidence, make_problem, widened
+from pipeline.contour_fit.problem import PER_CAMERA, State, first_evidence, make_problem, widen
 from pipeline.contour_fit.rim_term import observed_rim
 from pipeline.head_model.gaussian_process import SCALES, covariance, with_kernel
 from pipeline.head_model.model import HeadModel, load_model, with_modes
@@ -82,9 +82,9 @@ def test_an_outline_that_misses_the_head_says_little(model, planted):
     problem = make_problem(model, pose, silhouettes, rig, SETTINGS, {})
     state = State(coefficients, pose, np.zeros((len(rig), PER_CAMERA)))
     rim = observed_rim(problem, first_evidence(SETTINGS), state, schedule(SETTINGS, 60)[-1])
-    assert (estimated_unit(problem, rim, 12.0) or 0.0) < 5.0
+    assert (estimate_unit(problem, rim, 12.0) or 0.0) < 5.0
     strands = replace(rim, residual=5.0 * np.sin(rim.pixel[:, 0] / 20.0))
-    assert (estimated_unit(problem, strands, 12.0) or 0.0) > 100.0
+    assert (estimate_unit(problem, strands, 12.0) or 0.0) > 100.0
 
 
 @pytest.mark.gl
@@ -125,7 +125,7 @@ def test_feature_points_follow_a_wider_model(model, planted):
     features = {"pronasale": {camera.name: camera.project(at)[0] + 3.0 for camera in list(rig)[:3]}}
     few = with_modes(model, 20)
     problem = make_problem(few, pose, silhouettes, rig, SETTINGS, features)
-    wide = widened(problem, model, ("p95",))
+    wide = widen(problem, model, ("p95",))
     stage, evidence = schedule(SETTINGS, 20)[0], first_evidence(SETTINGS)
     none = np.zeros((len(rig), PER_CAMERA))
     narrow_cost = head_problem(problem, evidence, stage, 3.0).at(State(coefficients[:20], pose, none)).cost

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.contour_fit.contour import finish, judged_by, solve_contour, with_span_misfit
+from pipeline.contour_fit.contour import add_span_misfit, finish, judged_by, solve_contour
 from pipeline.contour_fit.fit import Fit
-from pipeline.contour_fit.posterior import RELIEF_OF_OUTLINES, vertex_deviation_mm, with_estimated_prior
+from pipeline.contour_fit.posterior import RELIEF_OF_OUTLINES, estimate_prior, vertex_deviation_mm
 from pipeline.head_model.gaussian_process import model_basis, with_kernel
 from pipeline.head_model.model import HeadModel, load_model, with_modes
 from pipeline.settings import FittingSettings, Settings
@@ -55,7 +55,7 @@ def test_a_head_beyond_the_span_is_said_to_be_farther_off(span, wider, renderer)
         subject = Planted(name, coefficients, Similarity.identity(), Similarity.identity())
         seen = binary_silhouettes(wider, subject, rig, renderer)
         solved = solve_contour(span, Similarity.identity(), seen, rig, FittingSettings())
-        fit = with_span_misfit(solved, wider, relief_mm=RELIEF_MM)
+        fit = add_span_misfit(solved, wider, relief_mm=RELIEF_MM)
         head = fit.world_from_head.apply(span.vertices(fit.coefficients))
         off = np.linalg.norm(head - wider.vertices(coefficients), axis=1)
         error[name] = float(np.median(off[face]))
@@ -87,13 +87,13 @@ def known_well(model: HeadModel) -> Fit:
 def test_relief_that_no_mode_follows_grows_with_how_far_the_head_strays(model: HeadModel) -> None:
     ears_off = model.levels["full"].face_region
     for relief_mm in (RELIEF_MM, RELIEF_OF_OUTLINES * RELIEF_MM):
-        fit = with_estimated_prior(model, known_well(model), EIGENHEADS, relief_mm=relief_mm)
+        fit = estimate_prior(model, known_well(model), EIGENHEADS, relief_mm=relief_mm)
         stated = vertex_deviation_mm(model, fit)[ears_off]
         np.testing.assert_allclose(np.median(stated), STRAYS * relief_mm, rtol=0.05)
 
 
 def test_a_fit_without_a_covariance_or_without_the_kernel_states_nothing_new(model: HeadModel) -> None:
     fit = known_well(model)
-    assert with_estimated_prior(model, fit, len(fit.coefficients), relief_mm=RELIEF_MM) is fit
+    assert estimate_prior(model, fit, len(fit.coefficients), relief_mm=RELIEF_MM) is fit
     silent = Fit("simplex", fit.coefficients, fit.world_from_head, 1, "converged")
-    assert with_estimated_prior(model, silent, EIGENHEADS, relief_mm=RELIEF_MM) is silent
+    assert estimate_prior(model, silent, EIGENHEADS, relief_mm=RELIEF_MM) is silent

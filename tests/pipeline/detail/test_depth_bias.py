@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from pipeline.detail.dense_points import SurfacePoints
-from pipeline.detail.depth_bias import measure_bias, points_on_face, without_window_bias
+from pipeline.detail.depth_bias import measure_bias, points_on_face, remove_window_bias
 from pipeline.part_labels.codes import Part
-from pipeline.stereo.depth_map import REACH_MM, WINDOW_MM, WindowBias, windowed_height, without_bias
+from pipeline.stereo.depth_map import REACH_MM, WINDOW_MM, WindowBias, subtract_bias, windowed_height
 from rig.mesh import Mesh
 
 NOISE_MM = 0.1
@@ -49,7 +49,7 @@ def test_a_planted_bias_is_taken_off() -> None:
     bias = measure_bias(seen)
     assert bias.common_mm == pytest.approx(-0.12, abs=0.02)
     assert bias.share == pytest.approx(0.9, abs=0.05)
-    found = without_window_bias(surface, seen, bias)
+    found = remove_window_bias(surface, seen, bias)
     inside = (np.abs(surface.points[:, :2] - 40.0) < 30.0).all(axis=1)
     true, normals = wall.vertices[::2], wall.normals()[::2]
 
@@ -76,7 +76,7 @@ def test_a_surface_that_windows_flattened_stands_out_again() -> None:
     normals, bias = wall.normals(), WindowBias(-0.1, 0.4)
     flat = wall.vertices + (bias.common_mm + bias.share * windowed_height(wall.vertices, normals))[:, None] * normals
     measured = wall.vertices[:, 0] > 20.0
-    found = without_bias(Mesh(flat, wall.faces), measured, bias)
+    found = subtract_bias(Mesh(flat, wall.faces), measured, bias)
     inside = (np.abs(wall.vertices[:, :2] - 40.0) < 15.0).all(axis=1)
 
     def off(points: np.ndarray) -> float:

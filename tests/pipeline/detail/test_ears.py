@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.detail.dense_points import SurfacePoints, thinned
-from pipeline.detail.ears import with_ears_in_place
+from pipeline.detail.dense_points import SurfacePoints, thin
+from pipeline.detail.ears import move_ears
 from pipeline.head_model.model import load_model
 from pipeline.head_model.regions import head_regions
 from pipeline.part_labels.codes import Part
@@ -24,7 +24,7 @@ def test_ears_go_where_points_show_them_and_nowhere_when_they_are_hidden(hidden:
     normals = vertex_normals(truth, faces)[shown]
     count = len(normals)
     points = SurfacePoints(truth[shown], normals, np.full(count, 0.2), np.full(count, Part.SKIN, np.uint8))
-    found = with_ears_in_place(vertices, model, thinned(points, 2.5))
+    found = move_ears(vertices, model, thin(points, 2.5))
     if hidden:
         np.testing.assert_array_equal(found, vertices)
     else:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.contour_fit.fit import Fit
-from pipeline.detail.expression_reading import with_read_expression
+from pipeline.detail.expression_reading import read_expression
 from pipeline.head_model.gaussian_process import with_kernel
 from pipeline.head_model.model import HeadModel, with_expressions, with_modes
 from rig.geometry import Similarity, rotation_from_vector
@@ -26,7 +26,7 @@ def read(model: HeadModel, weights: dict[str, float], *, known: int | None = Non
     unit = np.eye(len(reduced.modes) + 7) if covariance else None
     fit = Fit("contour", np.zeros(len(reduced.modes)), PLACE, 1, "planted", unit)
     observed, all_of_it = np.ones(len(head), bool), with_modes(model, known or len(model.modes))
-    return with_read_expression(fit, reduced, all_of_it, seen, observed, eigenheads=EIGENHEADS)
+    return read_expression(fit, reduced, all_of_it, seen, observed, eigenheads=EIGENHEADS)
 
 
 def weights_of(model: HeadModel, fit: Fit) -> dict[str, float]:
@@ -65,7 +65,7 @@ def test_a_model_without_expressions_is_left_alone(model: HeadModel) -> None:
     fit = Fit("contour", np.zeros(EIGENHEADS), PLACE, 1, "planted")
     head = PLACE.apply(model.vertices(np.zeros(0)))
     reduced, seen = replace(bare, posed=range(0)), np.ones(len(head), bool)
-    assert with_read_expression(fit, reduced, model, head, seen, eigenheads=EIGENHEADS) is fit
+    assert read_expression(fit, reduced, model, head, seen, eigenheads=EIGENHEADS) is fit
 
 
 def test_a_head_of_another_population_keeps_what_the_fit_says(model: HeadModel) -> None:
@@ -78,5 +78,5 @@ def test_a_head_of_another_population_keeps_what_the_fit_says(model: HeadModel) 
         z[reduced.posed.start + reduced.expressions.names.index("cheekPuff")] = 0.5
         head = PLACE.apply(reduced.vertices(z))
         seen = np.ones(len(head), bool)
-        result = with_read_expression(fit, reduced, model, head, seen, eigenheads=EIGENHEADS)
+        result = read_expression(fit, reduced, model, head, seen, eigenheads=EIGENHEADS)
         assert (result is fit) == left_alone

@@ -13,10 +13,10 @@ from pipeline.faces.irises import (
     EYEBALL_MM,
     Iris,
     UnseenEye,
-    believed,
     find_irises,
     looking_together,
     pupils_px,
+    reject_gazes,
 )
 from pipeline.faces.limbus import EyeView
 from pipeline.faces.matching import MatchedFaces
@@ -146,14 +146,14 @@ def iris(azimuth_deg: float, elevation_deg: float) -> Iris:
 def test_gazes_that_nobody_has_are_not_told() -> None:
     ahead, none = np.array([0.0, 0.0, 1.0]), UnseenEye("unclear")
     pair = {"right": iris(5.0, 0.0), "left": iris(-5.0, 0.0)}
-    assert believed(pair, ahead) == pair
-    assert believed({"right": iris(7.0, 0.0), "left": iris(-7.0, 0.0)}, ahead) == {"right": none, "left": none}
+    assert reject_gazes(pair, ahead) == pair
+    assert reject_gazes({"right": iris(7.0, 0.0), "left": iris(-7.0, 0.0)}, ahead) == {"right": none, "left": none}
     alone = {"right": UnseenEye("closed"), "left": iris(0.0, 18.0)}
-    assert believed(alone, ahead) == alone
-    assert believed({"right": UnseenEye("closed"), "left": iris(0.0, 25.0)}, ahead) == alone | {"left": none}
+    assert reject_gazes(alone, ahead) == alone
+    assert reject_gazes({"right": UnseenEye("closed"), "left": iris(0.0, 25.0)}, ahead) == alone | {"left": none}
     both_up = {"right": iris(0.0, 25.0), "left": iris(0.0, 25.0)}  # the one confirms the other
-    assert believed(both_up, ahead) == both_up
-    assert believed({"right": none, "left": none}, ahead) == {"right": none, "left": none}
+    assert reject_gazes(both_up, ahead) == both_up
+    assert reject_gazes({"right": none, "left": none}, ahead) == {"right": none, "left": none}
 
 
 def test_eyes_help_each_other_unless_they_squint() -> None:

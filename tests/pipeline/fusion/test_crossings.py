@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from pipeline.fusion.crossings import crossing_faces, without_coincidences
+from pipeline.fusion.crossings import crossing_faces, separate_coincidences
 from rig.mesh import Mesh
 
 
@@ -18,7 +18,7 @@ def two_touching_balls() -> Mesh:
 
 def test_sheets_that_touch_are_moved_apart() -> None:
     mesh = two_touching_balls()
-    apart = without_coincidences(mesh)
+    apart = separate_coincidences(mesh)
     moved = np.linalg.norm(apart.vertices - mesh.vertices, axis=1)
     assert (moved > 0.0).sum() == 2
     assert moved.max() < 0.1
@@ -30,4 +30,4 @@ def test_sheets_that_touch_are_moved_apart() -> None:
 def test_a_mesh_without_coincidences_stays() -> None:
     ball = trimesh.creation.icosphere(subdivisions=2)
     mesh = Mesh(np.asarray(ball.vertices), np.asarray(ball.faces, np.int32))
-    assert without_coincidences(mesh) is mesh
+    assert separate_coincidences(mesh) is mesh

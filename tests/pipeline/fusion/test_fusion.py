@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.fusion.fusion import BustSurface, NoSurface, finished, fuse, mask_warnings
+from pipeline.fusion.fusion import BustSurface, NoSurface, finish_bust, fuse, mask_warnings
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.stereo.depth_map import DepthMap, WindowBias
 from rig.mesh import Mesh, face_normals
@@ -24,7 +24,7 @@ def fused(made: Scene, head: Mesh | None = None, spacing_mm: float = SPACING_MM)
     surface = fuse(
         made.maps, made.silhouettes, made.rig, head, bias=WindowBias(), spacing_mm=spacing_mm, report=discard_progress
     )
-    return finished(surface, None, None, made.silhouettes, made.rig)
+    return finish_bust(surface, None, None, made.silhouettes, made.rig)
 
 
 def seen_errors(surface: BustSurface, made: Scene) -> np.ndarray:

@@ -11,8 +11,8 @@ from pipeline.fusion.hair import (
     INSET_MM,
     OFF_HEAD_MM,
     STUBBLE_MM,
-    grown_to_outlines,
-    loosened,
+    extend_to_outlines,
+    loosen_hair,
     parts_over_head,
     smooth_unresolved,
 )
@@ -57,7 +57,7 @@ def test_core_of_strands_grows_to_its_outlines_and_no_farther(outlines: Scene) -
     """A pixel is 1.4 mm; at a cosine of 0.15 an outline lies 0.7 mm before the ball."""
     core = ball(52.0)
     there, behind = bounded(core, outlines.rig)
-    grown, moved_mm = grown_to_outlines(core, np.ones(len(core.vertices)), outlines.silhouettes, outlines.rig)
+    grown, moved_mm = extend_to_outlines(core, np.ones(len(core.vertices)), outlines.silhouettes, outlines.rig)
     assert np.median(radii(grown)[there]) == pytest.approx(OUTLINE_MM - INSET_MM, abs=0.8)
     assert radii(grown).max() < OUTLINE_MM
     assert moved_mm[behind].max() < 0.01
@@ -67,7 +67,7 @@ def test_skin_beside_hair_stays(outlines: Scene) -> None:
     core = ball(52.0)
     there, _ = bounded(core, outlines.rig)
     up = core.vertices[:, 1] / 52.0
-    grown, moved_mm = grown_to_outlines(core, (up > 0.0).astype(float), outlines.silhouettes, outlines.rig)
+    grown, moved_mm = extend_to_outlines(core, (up > 0.0).astype(float), outlines.silhouettes, outlines.rig)
     assert moved_mm[up < -0.3].max() < 0.01
     assert np.median(radii(grown)[there & (up > 0.3)]) > 56.5
 
@@ -78,14 +78,14 @@ def test_view_that_is_left_out_says_nothing(outlines: Scene) -> None:
     wrong = {**outlines.silhouettes, name: replace(everywhere, quality=ViewQuality(usable=False))}
     without = {other: each for other, each in outlines.silhouettes.items() if other != name}
     hair = np.ones(len(core.vertices))
-    grown, _ = grown_to_outlines(core, hair, wrong, outlines.rig)
-    expected, _ = grown_to_outlines(core, hair, without, outlines.rig)
+    grown, _ = extend_to_outlines(core, hair, wrong, outlines.rig)
+    expected, _ = extend_to_outlines(core, hair, without, outlines.rig)
     np.testing.assert_array_equal(grown.vertices, expected.vertices)
 
 
 def test_head_without_hair_is_not_drawn(outlines: Scene) -> None:
     core = ball(56.0)
-    grown, moved_mm = grown_to_outlines(core, np.zeros(len(core.vertices)), outlines.silhouettes, outlines.rig)
+    grown, moved_mm = extend_to_outlines(core, np.zeros(len(core.vertices)), outlines.silhouettes, outlines.rig)
     assert grown is core
     assert not moved_mm.any()
 
@@ -159,7 +159,7 @@ def test_scattered_depth_makes_handles_and_loosened_depth_of_hair_none(outlines:
     shown = np.where(np.arange(3) == Part.HAIR.channel, 255, 0).astype(np.uint8)
     labels = {c.name: PartMap(c.name, np.tile(shown, (300, 400, 1))) for c in outlines.rig}
     for scatter in (0.0, 1.0):
-        loose = [loosened(each, labels, outlines.rig, scatter) for each in maps]
+        loose = [loosen_hair(each, labels, outlines.rig, scatter) for each in maps]
         mesh = fuse(
             loose, outlines.silhouettes, outlines.rig, None, bias=WindowBias(), spacing_mm=1.5, report=discard_progress
         ).mesh_world

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.fusion.fusion import finished, fuse
-from pipeline.fusion.hair import Places, distance_to_hull, find_silent_hair, local_share, only_where, without_specks
+from pipeline.fusion.fusion import finish_bust, fuse
+from pipeline.fusion.hair import Places, distance_to_hull, find_silent_hair, local_share, only_where, remove_specks
 from pipeline.fusion.view_stack import stack_views
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap
@@ -94,7 +94,7 @@ def test_specks_become_a_smooth_shell_that_counts_as_unseen(strands: Scene) -> N
     made = fuse(
         maps, strands.silhouettes, strands.rig, head(), bias=bias, spacing_mm=3.0, report=discard_progress, hair=hair
     )
-    surface = finished(made, votes, None, strands.silhouettes, strands.rig)
+    surface = finish_bust(made, votes, None, strands.silhouettes, strands.rig)
     check_closed(surface.mesh_world)
     above = surface.mesh_world.vertices[:, 1] > 5.0
     radii = np.linalg.norm(surface.mesh_world.vertices[above], axis=1)
@@ -123,8 +123,8 @@ def test_solid_hair_and_a_bald_head_stay_as_they_are(strands: Scene) -> None:
 def test_chance_depth_of_a_plain_shirt_is_left_out(strands: Scene) -> None:
     solid, parts = scene([OUTER], strands.rig).maps[0], labels(strands, Part.SKIN)
     rare = only_where(np.random.default_rng(0).random(solid.known.shape) < 0.1, solid)
-    assert without_specks(solid, parts, strands.rig) is solid
-    assert without_specks(rare, parts, strands.rig).known.sum() < 0.1 * rare.known.sum()
+    assert remove_specks(solid, parts, strands.rig) is solid
+    assert remove_specks(rare, parts, strands.rig).known.sum() < 0.1 * rare.known.sum()
 
 
 def test_share_counts_the_subject_alone(strands: Scene) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.fusion.refinement import MAX_MM, Measured, SeenVertices, deviation_mm, neighbours, without_islands
+from pipeline.fusion.refinement import MAX_MM, Measured, SeenVertices, deviation_mm, neighbours, remove_islands
 from pipeline.fusion.skin import REACH_MM, HeadSkin, combine_with_head, skin_share
 from rig.mesh import Mesh
 from tests.support.scenes import ellipsoid
@@ -168,13 +168,13 @@ def test_a_small_patch_with_nothing_seen_about_it_is_not_seen() -> None:
     front, behind = HEAD.vertices[:, 2] > 10.0, np.argmin(HEAD.vertices[:, 2])
     alone = np.zeros(len(front), bool)
     alone[HEAD.faces[(HEAD.faces == behind).any(axis=1)][:2]] = True  # two triangles
-    kept = without_islands(HEAD, seen_where(HEAD, front | alone))
+    kept = remove_islands(HEAD, seen_where(HEAD, front | alone))
     np.testing.assert_array_equal(kept.views > 0, front)
 
 
 def test_a_larger_patch_stays() -> None:
     back = HEAD.vertices[:, 2] < -85.0
-    kept = without_islands(HEAD, seen_where(HEAD, back))
+    kept = remove_islands(HEAD, seen_where(HEAD, back))
     np.testing.assert_array_equal(kept.views > 0, back)
 
 
@@ -182,7 +182,7 @@ def test_what_is_taken_off_has_the_deviation_of_a_guess() -> None:
     alone = np.zeros(len(HEAD.vertices), bool)
     alone[HEAD.faces[0]] = True
     before = seen_where(HEAD, alone)
-    after = without_islands(HEAD, before)
+    after = remove_islands(HEAD, before)
     found = [deviation_mm(SeenVertices.of(HEAD.vertices, one.views > 0), one) for one in (before, after)]
     assert found[0][HEAD.faces[0]].max() < 1.0
     assert (found[1] == MAX_MM).all()

@@ -19,8 +19,8 @@ from pipeline.fusion.untangling import (
     spoilt_faces,
     topology_of,
     turned_faces,
-    untangled,
-    untangled_head,
+    untangle,
+    untangle_head,
 )
 from pipeline.head_model.gaussian_process import model_basis
 from pipeline.head_model.model import HeadModel, load_model
@@ -65,7 +65,7 @@ def test_turned_and_folded_triangles_are_those_that_a_plain_test_finds() -> None
 def test_a_clean_surface_is_left_as_it_is() -> None:
     vertices, faces, _ = subdivided_sphere()
     moved = vertices * (1.0 + 0.02 * np.sin(vertices[:, :1] / 20.0))
-    np.testing.assert_array_equal(untangled(moved, topology_of(faces, len(moved))), moved)
+    np.testing.assert_array_equal(untangle(moved, topology_of(faces, len(moved))), moved)
 
 
 def test_a_dent_that_comes_out_behind_is_taken_back_and_the_rest_stays() -> None:
@@ -76,7 +76,7 @@ def test_a_dent_that_comes_out_behind_is_taken_back_and_the_rest_stays() -> None
     pushed[top] += (3.1, 1.7, -170.0)  # through the opposite side, 10 mm beyond it
     topology = topology_of(faces, len(pushed))
     assert crossing_faces(pushed, faces).sum() > 50
-    clean = untangled(pushed, topology)
+    clean = untangle(pushed, topology)
     assert not spoilt_faces(clean, topology).any()
     far = np.abs(vertices[:, 2]) < 40.0
     np.testing.assert_array_equal(clean[far], pushed[far])
@@ -92,7 +92,7 @@ def test_a_spot_gets_the_shape_at_rest_where_that_is_clean_and_is_flattened_with
     folded = moved.copy()
     folded[top] = np.random.default_rng(1).permutation(moved[top])
     assert spoilt_faces(folded, topology).any()
-    clean, flat = untangled(folded, topology, rest), untangled(folded, topology)
+    clean, flat = untangle(folded, topology, rest), untangle(folded, topology)
     for result in (clean, flat):
         assert mesh_faults(result, topology) == MeshFaults(0, 0, 0)
     assert np.linalg.norm(clean - moved, axis=1).max() < 0.1
@@ -131,7 +131,7 @@ def check_clean(model: HeadModel, seed: int, hostile: Displacement) -> None:
     vertices = model.vertices(random_face(model, rng))
     if seed % 2:
         vertices += hostile(rng)[:, None] * vertex_normals(vertices, model.levels["full"].faces)
-    mesh, deviation_mm = untangled_head(model, vertices, np.full(len(vertices), 0.3))
+    mesh, deviation_mm = untangle_head(model, vertices, np.full(len(vertices), 0.3))
     stored = mesh.vertices.astype(np.float32).astype(float)
     assert mesh_faults(stored, head_topology(model)) == MeshFaults(0, 0, 0), seed
     moved_mm = np.linalg.norm(mesh.vertices - vertices, axis=1)
@@ -150,10 +150,10 @@ def test_the_mean_head_and_a_few_random_ones_come_out_clean(wide_model: HeadMode
 def test_random_heads_and_expressions_come_out_clean_on_a_coarse_level(wide_model: HeadModel) -> None:
     level = wide_model.levels["p95"]
     topology = topology_of(level.faces, level.count)
-    rest, spoilt = untangled(wide_model.vertices(np.zeros(0), "p95"), topology), 0
+    rest, spoilt = untangle(wide_model.vertices(np.zeros(0), "p95"), topology), 0
     for seed in range(COARSE_SEEDS):
         vertices = wide_model.vertices(random_face(wide_model, np.random.default_rng(seed)), "p95")
-        clean = untangled(vertices, topology, rest)
+        clean = untangle(vertices, topology, rest)
         assert mesh_faults(clean.astype(np.float32).astype(float), topology) == MeshFaults(0, 0, 0), seed
         spoilt += spoilt_faces(vertices, topology).any()
     assert spoilt > COARSE_SEEDS / 2

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from pipeline.imaging.masks import BAND_PX, distance_to_level, without_holes
+from pipeline.imaging.masks import BAND_PX, distance_to_level, fill_holes
 from pipeline.imaging.sampling_kernels import refine_distance, segments_of_level
 from pipeline.imaging.silhouette import signed_distance
 
@@ -157,13 +157,13 @@ def test_what_is_enclosed_is_filled_and_what_reaches_the_border_is_not() -> None
     mask[4:6, 4:6] = False  # enclosed
     mask[7, 7:14] = False  # a notch
     mask[10:, 5:7] = True  # the subject leaves the picture
-    filled = without_holes(mask)
+    filled = fill_holes(mask)
     assert filled[4:6, 4:6].all()
     assert not filled[7, 7:].any()
     assert (filled & ~mask).sum() == 4
     assert not mask[4:6, 4:6].any()
 
-    corners = without_holes(~np.eye(6, dtype=bool))  # gaps that touch at their corners alone
+    corners = fill_holes(~np.eye(6, dtype=bool))  # gaps that touch at their corners alone
     assert (corners[2, 2], corners[0, 0], corners[5, 5]) == (True, False, False)
-    assert without_holes(np.ones((3, 4), bool)).all()
-    assert not without_holes(np.zeros((3, 4), bool)).any()
+    assert fill_holes(np.ones((3, 4), bool)).all()
+    assert not fill_holes(np.zeros((3, 4), bool)).any()

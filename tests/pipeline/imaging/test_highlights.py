@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.imaging.highlights import GAMMA, LIGHT, MIN_VIEWS, highlight_levels, without_highlights
+from pipeline.imaging.highlights import GAMMA, LIGHT, MIN_VIEWS, darken_highlights, highlight_levels
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from rig.colour_space import srgb_from_linear
 from rig.mesh import Mesh
@@ -45,7 +45,7 @@ def ball_mesh(shift_mm: float = 0.0) -> Mesh:
 
 def test_a_highlight_falls_to_the_skin_s_own_light() -> None:
     (shiny, silhouettes), (matte, _) = photographs(SHINE), photographs(0.0)
-    lowered = without_highlights(shiny, silhouettes, RIG, ball_mesh())
+    lowered = darken_highlights(shiny, silhouettes, RIG, ball_mesh())
     for camera in RIG:
         name = camera.name
         inside = silhouettes[name].distance < -6.0
@@ -59,7 +59,7 @@ def test_a_highlight_falls_to_the_skin_s_own_light() -> None:
 @pytest.mark.parametrize("shift_mm", [0.0, 3.0])
 def test_skin_without_highlights_stays_also_where_the_head_is_off(shift_mm: float) -> None:
     matte, silhouettes = photographs(0.0)
-    lowered = without_highlights(matte, silhouettes, RIG, ball_mesh(shift_mm))
+    lowered = darken_highlights(matte, silhouettes, RIG, ball_mesh(shift_mm))
     changed = np.array([np.abs(lowered[name].astype(int) - matte[name]).max(axis=2) > 2 for name in matte])
     assert changed.mean() < 0.01
 
@@ -67,7 +67,7 @@ def test_skin_without_highlights_stays_also_where_the_head_is_off(shift_mm: floa
 def test_two_views_decide_nothing_and_none_is_changed() -> None:
     shiny, silhouettes = photographs(SHINE)
     pair = RIG.subset(RIG.names[: MIN_VIEWS - 1])
-    lowered = without_highlights({name: shiny[name] for name in pair.names}, silhouettes, pair, ball_mesh())
+    lowered = darken_highlights({name: shiny[name] for name in pair.names}, silhouettes, pair, ball_mesh())
     assert all(lowered[name] is shiny[name] for name in pair.names)
 
 

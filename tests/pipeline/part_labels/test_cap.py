@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.contour_fit.bare_outline import without_cap
+from pipeline.contour_fit.bare_outline import shrink_cap_outlines
 from pipeline.detail.dense_points import SurfacePoints, skin_under_cap
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.part_labels.appearance_cells import Cells
@@ -88,7 +88,7 @@ def test_an_outline_moves_inwards_by_the_thickness_along_the_cap_alone():
     row, column = np.indices((SIZE, SIZE)) - SIZE // 2
     seen = silhouette_from_mask(np.hypot(row, column) < 22)
     worn = Cap({"a": seen.mask & (row < -4)}, thickness_mm=2.0, share=1.0)
-    bare = without_cap({"a": seen}, worn, Rig((camera,)), np.zeros(3))
+    bare = shrink_cap_outlines({"a": seen}, worn, Rig((camera,)), np.zeros(3))
     moved = bare.silhouettes["a"].distance - seen.distance
     at_top, at_bottom = (SIZE // 2 - 22, SIZE // 2), (SIZE // 2 + 21, SIZE // 2)
     assert moved[at_top] == pytest.approx(2.0 * FOCAL / DISTANCE_MM)

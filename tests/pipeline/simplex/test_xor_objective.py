@@ -14,7 +14,7 @@ from pipeline.imaging.silhouette import (
 )
 from pipeline.settings import FittingSettings
 from pipeline.simplex.hierarchy import HIERARCHY, LIMIT, fit_simplex
-from pipeline.simplex.xor_objective import SilhouetteObjective, face_pixels, lidded, mask_at_scale
+from pipeline.simplex.xor_objective import SilhouetteObjective, close_holes, face_pixels, mask_at_scale
 from rig.camera import Camera, Intrinsics
 from rig.errors import Cancelled
 from rig.geometry import Similarity, look_at, rotation_from_vector
@@ -99,11 +99,11 @@ def test_a_lid_over_the_neck_changes_no_pixel_that_may_speak(model: HeadModel, r
 
 def test_a_lid_closes_holes_outside_the_face_alone(model: HeadModel) -> None:
     level = model.levels["p99"]
-    shut = lidded(level.faces, level.face_region)
+    shut = close_holes(level.faces, level.face_region)
     assert is_closed(shut)
     assert not is_closed(level.faces)
     np.testing.assert_array_equal(shut[: len(level.faces)], level.faces)
-    assert lidded(level.faces, np.ones(level.count, bool)) is level.faces
+    assert close_holes(level.faces, np.ones(level.count, bool)) is level.faces
 
 
 def test_every_hole_gets_its_lid() -> None:
@@ -111,12 +111,12 @@ def test_every_hole_gets_its_lid() -> None:
     low, high = np.arange(5), np.arange(5, 10)
     after = np.roll(low, -1)
     walls = np.concatenate([np.stack([low, after, high], 1), np.stack([after, after + 5, high], 1)])
-    shut = lidded(walls, np.zeros(10, bool))
+    shut = close_holes(walls, np.zeros(10, bool))
     assert is_closed(shut)
     assert len(shut) == len(walls) + 2 * 3
     assert shut.dtype == walls.dtype
     only_above = np.arange(10) >= 5
-    assert lidded(walls, only_above) is walls
+    assert close_holes(walls, only_above) is walls
 
 
 def test_a_contour_through_pixels_centres_falls_as_a_chessboard_and_a_larger_pixel_averages_all_it_covers() -> None:

@@ -10,7 +10,7 @@ from pipeline.texturing.albedo import DIM_SHARE, Albedo, estimate_albedo, shine_
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, unwrap
 from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from pipeline.texturing.paint import paint_texture
-from pipeline.texturing.vertex_colours import Texture, texture, underexposed_views
+from pipeline.texturing.vertex_colours import Texture, colour_vertices, underexposed_views
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
@@ -65,7 +65,7 @@ def found(mesh: Mesh, layout: Layout) -> dict[str, tuple[Atlas, Albedo, np.ndarr
         capture = Capture({key: codes for key, (codes, _) in shots.items()})
         silhouettes = {key: silhouette_from_mask(mask) for key, (_, mask) in shots.items()}
         depths, settings = depth_maps(rig, mesh), TextureSettings()
-        coloured = texture(
+        coloured = colour_vertices(
             mesh, capture, silhouettes, rig, depths, settings=settings, around=around, dim_share=DIM_SHARE
         )
         assert coloured.decision is not None

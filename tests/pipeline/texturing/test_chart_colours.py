@@ -5,11 +5,11 @@ import numpy as np
 from pipeline.imaging.colour_chart import Chart, ChartCorrection, true_colours
 from pipeline.texturing.chart_colours import (
     ChartColours,
-    chart_colours,
     colours_of_charts,
-    in_true_colours,
+    correct_capture,
+    correct_picture,
     levelled_by_chart,
-    with_true_colours,
+    measure_charts,
 )
 from pipeline.texturing.light import BAND_FACTORS, Light, harmonics
 from rig.camera import Camera
@@ -34,7 +34,7 @@ def seen_in(camera: Camera, tint: np.ndarray) -> Chart:
 def test_a_picture_is_multiplied_in_linear_light_and_clipped() -> None:
     linear = np.array([[[0.2, 0.3, 0.1], [0.9, 0.9, 0.9]]])
     codes = np.rint(255 * srgb_from_linear(linear)).astype(np.uint8)
-    found = in_true_colours(codes, MATRIX)
+    found = correct_picture(codes, MATRIX)
     np.testing.assert_allclose(found, 255 * srgb_from_linear(np.clip(linear @ MATRIX.T, 0, 1)), atol=2)
     assert found[0, 1, 2] == 255
 
@@ -49,7 +49,7 @@ def test_a_chart_corrects_its_camera_and_the_mean_the_others() -> None:
     assert set(colours.cameras) == {one, other}
     np.testing.assert_allclose(colours.cameras[one].matrix, np.diag([2.0, 1.25, 1.25]), atol=1e-6)
     np.testing.assert_allclose(colours.normal_world, [0, 0, 1], atol=1e-3)
-    shown = with_true_colours(Capture(images={name: grey(128) for name in (one, other, bare)}), colours).images
+    shown = correct_capture(Capture(images={name: grey(128) for name in (one, other, bare)}), colours).images
     assert np.abs(shown[other].astype(int) - 128).max() <= 1
     assert shown[one][0, 0, 0] > shown[bare][0, 0, 0] > shown[other][0, 0, 0]
     assert shown[one][0, 0, 0] > shown[one][0, 0, 1]
@@ -58,7 +58,7 @@ def test_a_chart_corrects_its_camera_and_the_mean_the_others() -> None:
 def test_the_charts_of_all_plates_are_looked_for() -> None:
     rig, wall = default_layout(), photograph(placed(0.01, 0.0), np.eye(3))
     plates = {"cam04": (wall,), "cam05": (wall, photograph(placed(200, 5), np.diag([0.5, 0.8, 0.8])))}
-    colours, warnings = chart_colours(Capture(images={}, backgrounds=plates), rig)
+    colours, warnings = measure_charts(Capture(images={}, backgrounds=plates), rig)
     assert colours is not None
     assert not warnings
     assert set(colours.cameras) == {"cam05"}
@@ -66,7 +66,7 @@ def test_the_charts_of_all_plates_are_looked_for() -> None:
 
 
 def test_without_a_chart_there_is_a_warning() -> None:
-    colours, warnings = chart_colours(Capture(images={}, backgrounds={"cam05": (grey(1),)}), default_layout())
+    colours, warnings = measure_charts(Capture(images={}, backgrounds={"cam05": (grey(1),)}), default_layout())
     assert colours is None
     assert [warning.code for warning in warnings] == ["no-chart"]
     assert warnings[0].text.startswith("no clean plate shows a ColorChecker Classic")
@@ -84,7 +84,7 @@ def test_light_is_levelled_to_what_falls_on_the_chart() -> None:
 
 def test_a_correction_is_what_it_says() -> None:
     colours = ChartColours({"a": ChartCorrection(MATRIX, 0.01)}, np.array([0.0, 0.0, 1.0]))
-    shown = with_true_colours(Capture(images={"a": grey(90)}, texture_sets={"cross": {"a": grey(90)}}), colours)
+    shown = correct_capture(Capture(images={"a": grey(90)}, texture_sets={"cross": {"a": grey(90)}}), colours)
     assert shown.images["a"].dtype == np.uint8
-    assert shown.images["a"][0, 0].tolist() == in_true_colours(grey(90), MATRIX)[0, 0].tolist()
+    assert shown.images["a"][0, 0].tolist() == correct_picture(grey(90), MATRIX)[0, 0].tolist()
     np.testing.assert_array_equal(shown.texture_sets["cross"]["a"], shown.images["a"])

@@ -11,7 +11,7 @@ from pipeline.settings import TextureSettings
 from pipeline.texturing.layout.uv_unwrap import Layout, unwrap
 from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from pipeline.texturing.paint import paint_texture, texture_size
-from pipeline.texturing.vertex_colours import Texture, texture
+from pipeline.texturing.vertex_colours import Texture, colour_vertices
 from rig.colour_space import srgb_from_linear
 from rig.mesh import Mesh
 from tests.support.changed_rigs import relensed
@@ -40,7 +40,7 @@ def coloured(shot: Shot) -> Texture:
     mesh = shot.mesh
     around = Neighbourhood.of(*neighbours(mesh.faces, len(mesh.vertices)))
     depths, settings = depth_maps(shot.rig, mesh), TextureSettings()
-    return texture(mesh, shot.capture, shot.silhouettes, shot.rig, depths, settings=settings, around=around)
+    return colour_vertices(mesh, shot.capture, shot.silhouettes, shot.rig, depths, settings=settings, around=around)
 
 
 @pytest.fixture(scope="module")

@@ -22,14 +22,14 @@ from pipeline.texturing.vertex_colours import (
     MIN_LIKENESS,
     Texture,
     add_similar_views,
+    colour_vertices,
     fill_unobserved_patches,
     find_unlike,
     select_views,
-    texture,
     wide_doubtful_surface,
 )
 from pipeline.texturing.view_selection_kernels import OUTLIER, RING_SHARE, differences, fill_slots
-from pipeline.texturing.visibility import see_weights, sharpened
+from pipeline.texturing.visibility import see_weights, sharpen
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
 from rig.mesh import Mesh
@@ -41,8 +41,8 @@ EXPOSURES = np.array([0.8, 1.2, 0.9, 1.1, 1.2, 0.8, 1.0])[:, None] * np.array([1
 
 
 def colour(shot: Shot, outlier: float = OUTLIER, **settings) -> Texture:
-    chosen, depths = TextureSettings(**settings), depth_maps(shot.rig, shot.mesh)
-    return texture(shot.mesh, shot.capture, shot.silhouettes, shot.rig, depths, settings=chosen, outlier=outlier)
+    made, depths = TextureSettings(**settings), depth_maps(shot.rig, shot.mesh)
+    return colour_vertices(shot.mesh, shot.capture, shot.silhouettes, shot.rig, depths, settings=made, outlier=outlier)
 
 
 def psnr(found: Texture, shot: Shot, where: np.ndarray) -> float:
@@ -114,7 +114,7 @@ def test_hidden_surfaces_take_no_colour_from_what_hides_them() -> None:
     image = np.rint(255 * srgb_from_linear(np.where(np.isfinite(depth)[:, :, None], linear, 0.3))).astype(np.uint8)
     silhouette = silhouette_from_mask(np.isfinite(depth))
     capture = Capture({"cam00": image})
-    found = texture(mesh, capture, {"cam00": silhouette}, rig, {"cam00": depth}, settings=TextureSettings())
+    found = colour_vertices(mesh, capture, {"cam00": silhouette}, rig, {"cam00": depth}, settings=TextureSettings())
     lit = found.views[:count] > 0
     assert lit.sum() > 500
     assert (found.colours[:count][lit][:, 0] < 80).all()
@@ -159,7 +159,7 @@ def test_sharpening_takes_back_blur_where_there_is_detail_and_lifts_no_noise() -
     truth[:, :160][:, ::16] = truth[:, 1:160][:, ::16] = 40.0  # two dark pixels in sixteen, like lashes
     blurred = cv2.GaussianBlur(truth, (0, 0), 0.7) + rng.normal(0, 3, truth.shape)
     image = np.clip(np.rint(blurred), 0, 255).astype(np.uint8)
-    found = sharpened(image, np.ones((240, 320), bool), 1.0).astype(float)
+    found = sharpen(image, np.ones((240, 320), bool), 1.0).astype(float)
     lines, flat = np.s_[10:-10, 10:150], np.s_[10:-10, 180:-10]
     before, after = (np.abs(picture[lines] - truth[lines]).mean() for picture in (image, found))
     assert after < 0.8 * before
@@ -232,7 +232,7 @@ def test_a_strip_across_an_opening_takes_one_photograph() -> None:
     mesh, strip = with_strip(ellipsoid(5))
     settings, depths = TextureSettings(), depth_maps(shot.rig, mesh)
     around = Neighbourhood.of(*neighbours(mesh.faces, len(mesh.vertices)))
-    found = texture(mesh, shot.capture, shot.silhouettes, shot.rig, depths, settings=settings, around=around)
+    found = colour_vertices(mesh, shot.capture, shot.silhouettes, shot.rig, depths, settings=settings, around=around)
     assert found.decision is not None
     rim = np.unique(mesh.faces[strip])  # hidden by lids, as it were
     weights, slots, shares = (

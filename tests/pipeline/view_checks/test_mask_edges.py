@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
-from pipeline.view_checks.mask_edges import edge_beside, masks_alone_exchanged, masks_off_edges, turned_masks
+from pipeline.view_checks.mask_edges import edge_beside, find_turned_masks, masks_alone_exchanged, masks_off_edges
 
 NAMES = ("cam00", "cam01", "cam02")
 
@@ -75,8 +75,8 @@ def test_masks_under_other_names_are_told_from_pictures_and_masks_together() -> 
 )
 def test_masks_that_are_turned_against_the_photographs_are_named(rows: int, columns: int, turn: str | None) -> None:
     masks = {name: grown(np.ascontiguousarray(subject(k)[::rows, ::columns]), 0) for k, name in enumerate(NAMES)}
-    found = turned_masks(IMAGES, masks, NAMES)
+    found = find_turned_masks(IMAGES, masks, NAMES)
     assert {name: said.code for name, said in found.items()} == (dict.fromkeys(NAMES, turn) if turn else {})
     one = {**{name: grown(subject(k), 0) for k, name in enumerate(NAMES)}, "cam01": masks["cam01"]}
-    assert [*turned_masks(IMAGES, one, NAMES)] == (["cam01"] if turn else [])
-    assert turned_masks(IMAGES, masks, ()) == {}
+    assert [*find_turned_masks(IMAGES, one, NAMES)] == (["cam01"] if turn else [])
+    assert find_turned_masks(IMAGES, masks, ()) == {}

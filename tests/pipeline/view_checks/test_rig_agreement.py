@@ -11,7 +11,7 @@ from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.multiview.tangency import outer_hull
 from pipeline.view_checks.camera_assignment import INSET_PX, mean_misfit, tangency_errors_px
-from pipeline.view_checks.rig_agreement import are_loose, find_lens_reading, misplaced_camera, wrong_rig
+from pipeline.view_checks.rig_agreement import are_loose, explain_disagreement, find_lens_reading, misplaced_camera
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.plausibility import rig_faults
 from rig.studio.scene.layout import HEIGHT, WIDTH, default_layout
@@ -45,9 +45,9 @@ def reflected(rig, axis):
 def test_the_rig_that_took_the_pictures_is_left_alone(seen):
     rig, _, of_all = seen
     rng = np.random.default_rng(5)
-    assert wrong_rig(of_all, rig) is None
+    assert explain_disagreement(of_all, rig) is None
     for count in range(3, 11):
-        assert wrong_rig(of_all, rig.subset(rng.choice(rig.names, count, replace=False))) is None
+        assert explain_disagreement(of_all, rig.subset(rng.choice(rig.names, count, replace=False))) is None
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_a_mirrored_rig_is_named_where_some_outlines_are_loose_too(seen, axis, l
     rig, masks, _ = seen
     spread = {name: cv2.dilate(mask.astype(np.uint8), np.ones((loose_px + 1, 1))) > 0 for name, mask in masks.items()}
     loose = {name: spread[name] if k % 3 == 0 else masks[name] for k, name in enumerate(masks)}
-    found = wrong_rig(silhouettes(loose), reflected(rig, axis))
+    found = explain_disagreement(silhouettes(loose), reflected(rig, axis))
     assert found is not None
     assert found.code == "rig-mirrored"
     assert "write it right-handed" in found.text
@@ -79,7 +79,7 @@ def test_quaternions_with_the_real_part_last_are_named_though_the_views_that_the
 
     contradicted = ViewQuality(usable=False, figures={"strange_share": 0.04})
     spoilt = {name: replace(s, quality=contradicted) if k % 2 else s for k, (name, s) in enumerate(of_all.items())}
-    found = wrong_rig(spoilt, reposed(default_layout().scaled(0.5), pose))
+    found = explain_disagreement(spoilt, reposed(default_layout().scaled(0.5), pose))
     assert found is not None
     assert "quaternions whose real part came last" in found.text
 
@@ -90,7 +90,7 @@ def test_rotations_that_are_transposed_are_named_where_the_cameras_look_at_the_o
     rig = default_layout().scaled(0.5)
     written = reposed(rig, lambda pose: RigidTransform(pose.rotation.T, pose.translation))
     assert rig_faults(written) == []
-    found = wrong_rig(of_all, written)
+    found = explain_disagreement(of_all, written)
     assert found is not None
     assert "contains the rotation transposed" in found.text
     assert "transpose each rotation" in found.text
@@ -114,7 +114,7 @@ def test_one_camera_far_from_its_place_is_named_and_no_good_one(seen):
 )
 def test_pictures_that_are_all_turned_alike_are_named(seen, change, word):
     rig, masks, _ = seen
-    assert word in str(wrong_rig(silhouettes({name: change(mask) for name, mask in masks.items()}), rig))
+    assert word in str(explain_disagreement(silhouettes({name: change(mask) for name, mask in masks.items()}), rig))
 
 
 @pytest.mark.parametrize(("quarters", "word"), [(1, "90 degrees anticlockwise"), (3, "90 degrees clockwise")])
@@ -124,9 +124,9 @@ def test_square_pictures_turned_by_90_degrees_are_named(seen, quarters, word):
     beside, height = (WIDTH - HEIGHT) // 4, HEIGHT // 2
     square = relensed(rig, lambda k: replace(k, width=height, cx=k.cx - beside))
     cropped = {name: mask[:, beside:-beside] for name, mask in masks.items()}
-    assert wrong_rig(silhouettes(cropped), square) is None
+    assert explain_disagreement(silhouettes(cropped), square) is None
     turned = {name: np.rot90(mask, quarters) for name, mask in cropped.items()}  # anticlockwise
-    assert word in str(wrong_rig(silhouettes(turned), square))
+    assert word in str(explain_disagreement(silhouettes(turned), square))
 
 
 @pytest.mark.parametrize(("quarters", "word"), [(1, "90 degrees anticlockwise"), (3, "90 degrees clockwise")])
@@ -135,14 +135,14 @@ def test_turned_pictures_whose_cameras_had_width_and_height_exchanged_are_named(
     rig, masks, _ = seen
     written = relensed(rig, lambda k: replace(k, width=k.height, height=k.width, cx=k.cy, cy=k.cx))
     turned = {name: np.rot90(mask, quarters) for name, mask in masks.items()}  # anticlockwise
-    assert word in str(wrong_rig(silhouettes(turned), written))
+    assert word in str(explain_disagreement(silhouettes(turned), written))
 
 
 @pytest.mark.slow
 def test_the_calibration_of_another_rig_is_named(seen):
     _, _, of_all = seen
     for name in ARRANGEMENTS_DEG:
-        found = wrong_rig(of_all, arrangement(name).scaled(0.5))
+        found = explain_disagreement(of_all, arrangement(name).scaled(0.5))
         assert found is not None
         assert "is of another rig" in found.text
         assert "calibrate it again" in found.text
@@ -151,7 +151,7 @@ def test_the_calibration_of_another_rig_is_named(seen):
 @pytest.mark.slow
 def test_principal_points_of_the_whole_picture_are_named_where_it_was_cropped(seen):
     rig, _, of_all = seen
-    found = wrong_rig(of_all, relensed(rig, lambda k: replace(k, cx=k.cx + 60, cy=k.cy + 40)))
+    found = explain_disagreement(of_all, relensed(rig, lambda k: replace(k, cx=k.cx + 60, cy=k.cy + 40)))
     assert found is not None
     changes = found.parameters["changes"]
     assert isinstance(changes, tuple)
@@ -173,7 +173,7 @@ def test_principal_points_counted_from_below_are_named(seen):
         shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, camera.intrinsics.cy - was]])
         mask = of_all[camera.name].mask.astype(np.uint8)
         moved[camera.name] = cv2.warpAffine(mask, shift, mask.shape[::-1], borderMode=cv2.BORDER_REPLICATE) > 0
-    found = wrong_rig(silhouettes(moved), rig_of(-1.0))
+    found = explain_disagreement(silhouettes(moved), rig_of(-1.0))
     assert found is not None
     assert found.code == "principal-points-from-below"
 

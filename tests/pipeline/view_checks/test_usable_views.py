@@ -17,10 +17,10 @@ from pipeline.view_checks.usable_views import (
     UsableViews,
     blurred_views,
     plates_brightness,
+    replace_by_faults,
     turned_against_plate,
     usable_views,
     view_warnings,
-    with_picture_faults,
 )
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
@@ -177,7 +177,7 @@ def outlines() -> dict[str, Silhouette]:
 def test_nothing_is_said_of_good_pictures(capture: Capture, outlines: dict[str, Silhouette]) -> None:
     assert blurred_views(capture.images, outlines) == {}
     assert [turned_against_plate(capture, name) for name in NAMES] == [None] * 4
-    assert with_picture_faults(outlines, capture, NAMES, RIG) == outlines
+    assert replace_by_faults(outlines, capture, NAMES, RIG) == outlines
     unlike = {"a": capture.images["a"], "b": np.zeros_like(capture.images["b"])}
     assert blurred_views(unlike, outlines) == {}, "two views do not tell what is sharp"
 
@@ -187,7 +187,7 @@ def test_a_blurred_picture_is_named_alone(capture: Capture, outlines: dict[str, 
     blurred = replace(capture, images={**capture.images, "c": cv2.GaussianBlur(capture.images["c"], (0, 0), sigma)})
     weak = replace(outlines["c"].quality, warnings=(compose("outline-weak", share=0.3),))
     doubted = {**outlines, "c": replace(outlines["c"], quality=weak)}
-    found = with_picture_faults(doubted, blurred, ["c"], RIG)
+    found = replace_by_faults(doubted, blurred, ["c"], RIG)
     assert [fault.code for fault in found["c"].quality.warnings] == ["detail-missing"]
     assert found["c"].quality.usable
     assert all(found[name] is outlines[name] for name in "abd")
@@ -203,7 +203,7 @@ def test_a_blurred_picture_is_named_alone(capture: Capture, outlines: dict[str, 
 )
 def test_a_turned_picture_is_named_and_left_out(capture: Capture, outlines: dict, turned, word: str) -> None:
     pictures = {**capture.images, "b": np.ascontiguousarray(turned(capture.images["b"]))}
-    found = with_picture_faults(outlines, replace(capture, images=pictures), ["b"], RIG)
+    found = replace_by_faults(outlines, replace(capture, images=pictures), ["b"], RIG)
     assert not found["b"].quality.usable
     (fault,) = found["b"].quality.warnings
     assert word in fault.text

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from rig.acquisition.judgement import examine_picture, judge_checks, occupied, plate_faults, plate_level
+from rig.acquisition.judgement import examine_picture, find_occupied, judge_checks, plate_faults, plate_level
 from rig.acquisition.plates import NO_PLATES, Plates
 from rig.formats.rig_toml import ShotConfig
 from tests.support.textured_studio import NAMES, FlatStudio
@@ -67,15 +67,15 @@ def in_use() -> Plates:
 
 
 def test_somebody_who_sits_in_the_new_plates_is_seen_by_comparison_and_another_wall_is_nobody() -> None:
-    faults = occupied(plates_of(SMALL_SEATED), in_use())
+    faults = find_occupied(plates_of(SMALL_SEATED), in_use())
     assert {(fault.code, fault.camera) for fault in faults} == {("occupied", name) for name in CAMERAS}
-    assert occupied(plates_of(SMALL_EMPTY), in_use()) == []
-    assert occupied(plates_of(SMALL_EMPTY, light=0.8), in_use()) == [], "dimmer lamps are nobody"
-    assert occupied(plates_of(SMALL_SEATED), NO_PLATES) == [], "there is nothing to compare the first ones with"
+    assert find_occupied(plates_of(SMALL_EMPTY), in_use()) == []
+    assert find_occupied(plates_of(SMALL_EMPTY, light=0.8), in_use()) == [], "dimmer lamps are nobody"
+    assert find_occupied(plates_of(SMALL_SEATED), NO_PLATES) == [], "there is nothing to compare the first ones with"
     # A bumped camera is the reason for which new plates are taken.
     taken = plates_of(SMALL_EMPTY)
     taken["cam02"] = [SMALL_EMPTY("cam08", 0.0) for _ in range(3)]
-    assert occupied(taken, in_use()) == []
+    assert find_occupied(taken, in_use()) == []
 
 
 def test_what_moves_stands_still_or_is_dark_is_named() -> None:

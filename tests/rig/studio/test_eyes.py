@@ -10,8 +10,8 @@ from rig.errors import InputError
 from rig.geometry import Similarity, look_at, rotation_from_vector
 from rig.mesh import Mesh, face_normals
 from rig.rig import Rig
-from rig.studio.scene.eyes import LIMBUS_MM, RADIUS_MM, opened, surface
-from rig.studio.scene.subject import Subject, with_gaze
+from rig.studio.scene.eyes import LIMBUS_MM, RADIUS_MM, open_lids, surface
+from rig.studio.scene.subject import Subject, add_eyeballs
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def sitter() -> Subject:
 
 @pytest.fixture(scope="module")
 def looking(sitter: Subject) -> Subject:
-    return with_gaze(sitter, 12.0, -5.0, np.random.default_rng(1))
+    return add_eyeballs(sitter, 12.0, -5.0, np.random.default_rng(1))
 
 
 def test_both_eyes_look_at_one_point(looking: Subject) -> None:
@@ -42,7 +42,7 @@ def test_both_eyes_look_at_one_point(looking: Subject) -> None:
 
 
 def test_lids_stand_before_the_eyeballs_and_let_them_be_seen(sitter: Subject, looking: Subject) -> None:
-    head = opened(sitter.mesh, sitter.landmarks)
+    head = open_lids(sitter.mesh, sitter.landmarks)
     np.testing.assert_array_equal(head.vertices[: len(sitter.mesh.vertices)], sitter.mesh.vertices)
     lens = Intrinsics(400, 200, 2600.0, 2600.0, 199.5, 99.5)
     front = Camera(
@@ -73,4 +73,4 @@ def test_the_truth_holds_the_eyes_and_a_head_without_landmarks_gets_none(looking
     np.testing.assert_allclose(placed.iris_centre, pose.apply(eye.iris_centre[None])[0])
     np.testing.assert_allclose(placed.gaze, pose.rotation @ eye.gaze)
     with pytest.raises(InputError, match="landmarks"):
-        with_gaze(Subject(sitter.mesh), 0.0, 0.0, np.random.default_rng(1))
+        add_eyeballs(Subject(sitter.mesh), 0.0, 0.0, np.random.default_rng(1))

@@ -9,10 +9,10 @@ from rig.errors import InputError
 from rig.mesh import Mesh, face_normals, vertex_normals
 from rig.render.renderer import Renderer
 from rig.studio.scene.anatomy import Anatomy, anatomy, finer_grid
-from rig.studio.scene.hair import HairStyle, beard_share, curled, grow, hang, knot
+from rig.studio.scene.hair import HairStyle, add_curls, beard_share, grow, hang, knot
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
-from rig.studio.scene.subject import HAIRSTYLES, Look, Subject, dress, restyled
+from rig.studio.scene.subject import HAIRSTYLES, Look, Subject, dress, restyle
 from rig.studio.scene.worn import cap, glasses
 from tests.rig.studio.test_images import egg_head
 from tests.support.small_studio import CLEAN
@@ -50,7 +50,7 @@ def test_no_curls_where_their_amount_is_zero():
     points = np.random.default_rng(2).uniform(-100, 100, (4000, 3))
     normals = np.tile((0.0, 0.0, 1.0), (4000, 1))
     amount = (points[:, 0] > 0).astype(float)
-    moved, shade = curled(points, normals, 8.0, amount, rng())
+    moved, shade = add_curls(points, normals, 8.0, amount, rng())
     np.testing.assert_array_equal(moved[amount == 0], points[amount == 0])
     np.testing.assert_array_equal(shade[amount == 0], 1.0)
     assert 1.0 < (moved - points)[amount > 0, 2].std() < 8.0
@@ -145,15 +145,15 @@ def test_a_head_without_landmarks_says_that_it_can_wear_neither_glasses_nor_bear
 
 
 def test_names_add_up_in_their_order_and_unknown_ones_are_refused():
-    look = restyled(plain_look(), ["curly", "beard", "glasses"])
+    look = restyle(plain_look(), ["curly", "beard", "glasses"])
     assert look.hair is not None
     assert look.beard is not None
     assert look.hair.curl_mm > 0
     assert look.glasses
-    assert restyled(look, ["bald"]).hair is None
-    assert restyled(plain_look(), []) == plain_look()
+    assert restyle(look, ["bald"]).hair is None
+    assert restyle(plain_look(), []) == plain_look()
     with pytest.raises(InputError, match=r"mohawk is not one of short, .*glasses"):
-        restyled(plain_look(), ["long", "mohawk"])
+        restyle(plain_look(), ["long", "mohawk"])
 
 
 def photographed(renderer: Renderer, *hairstyle: str) -> SimulatedCapture:

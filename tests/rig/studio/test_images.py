@@ -21,7 +21,7 @@ from rig.studio.scene.subject import Look, Subject, random_look
 from rig.studio.sensor import sensor as sensors
 from rig.studio.sensor.faults import KINDS, Fault, fault_from_text
 from rig.studio.sensor.preset import PRESET
-from rig.studio.sensor.sensor import Sensor, drift, expose, focus, rolled
+from rig.studio.sensor.sensor import Sensor, drift, expose, focus, roll_shutter
 from tests.support import oracles
 from tests.support.layouts import ARRANGEMENTS_DEG, arrangement
 from tests.support.small_studio import CLEAN
@@ -213,7 +213,7 @@ def test_a_rolling_shutter_leans_an_upright_bar_by_the_motion():
     height, width, shift_px = 101, 120, np.array([6.0, 4.0])
     still = np.zeros((height, width, 4), np.float32)
     still[:, 50:58] = 1.0
-    seen = rolled(still, shift_px)
+    seen = roll_shutter(still, shift_px)
     middle = (seen[:, :, 3] * np.arange(width)).sum(axis=1) / seen[:, :, 3].sum(axis=1)
     np.testing.assert_allclose(middle, 53.5 + shift_px[0] * (np.arange(height) / 100 - 0.5), atol=0.02)
 

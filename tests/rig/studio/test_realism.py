@@ -13,9 +13,9 @@ from rig.studio.scene.anatomy import anatomy
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.skin_texture import DRY, oily_zones
-from rig.studio.scene.subject import scattered
+from rig.studio.scene.subject import scatter_light
 from rig.studio.sensor.preset import PRESET, REALISM, made_real, realism_names
-from rig.studio.sensor.sensor import Sensor, compressed, expose, through_mosaic
+from rig.studio.sensor.sensor import Sensor, compress_jpeg, expose, through_mosaic
 from tests.rig.studio.test_images import egg_head
 from tests.support.scenes import ellipsoid
 from tests.support.small_studio import CLEAN
@@ -54,7 +54,7 @@ def test_light_spreads_and_none_is_lost() -> None:
     front = mesh.vertices[:, 2] > 0.0
     spot = np.exp(-0.5 * (mesh.vertices[:, :2] ** 2).sum(axis=1) / 6.0**2) * front
     light = np.repeat(spot[:, None], 3, axis=1)
-    found = scattered(mesh.vertices, mesh.faces, light, (8.0, 4.0, 0.0))
+    found = scatter_light(mesh.vertices, mesh.faces, light, (8.0, 4.0, 0.0))
     double = np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1)
     area = np.bincount(mesh.faces.ravel(), np.repeat(double / 6.0, 3), len(spot))
     assert area @ found == pytest.approx(area @ light, rel=1e-6)
@@ -142,6 +142,6 @@ def test_jpeg_costs_little_at_its_quality_and_more_below() -> None:
     rows, columns = np.mgrid[:64, :96]
     picture = np.stack([rows + columns, 2 * rows, 200 - columns], axis=2).clip(0, 255).astype(np.uint8)
     picture = np.clip(picture + rng.normal(0, 2, picture.shape), 0, 255).astype(np.uint8)
-    off = [np.abs(compressed(picture, quality).astype(int) - picture).mean() for quality in (92, 40)]
+    off = [np.abs(compress_jpeg(picture, quality).astype(int) - picture).mean() for quality in (92, 40)]
     assert 0.0 < off[0] < 2.5 < off[1] + 1.0
     assert off[0] < off[1]

@@ -8,7 +8,7 @@ import pytest
 from rig.messages.message import compose
 from server.batch.folder import FailureRecord
 from server.batch.run import Outcome
-from server.cli.batch import BatchDisplay, BatchProgress, told_time
+from server.cli.batch import BatchDisplay, BatchProgress, format_time
 
 FAILURE = FailureRecord("input", compose("batch-list-empty"), (), None)
 
@@ -81,4 +81,4 @@ def test_the_last_capture_has_one_worker_however_many_there_are() -> None:
 
 @pytest.mark.parametrize(("seconds", "words"), [(0, "0 s"), (89, "89 s"), (840, "14 min"), (9000, "2.5 h")])
 def test_times_in_words(seconds: float, words: str) -> None:
-    assert told_time(seconds) == words
+    assert format_time(seconds) == words

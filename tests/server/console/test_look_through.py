@@ -11,7 +11,7 @@ from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
-from server.console.media import camera_views, straightened, straightened_face
+from server.console.media import camera_views, straighten, straighten_face
 
 LENS = Distortion(-0.14, 0.04, 0.001, -0.0008, 0.0)
 
@@ -46,7 +46,7 @@ def test_a_straightened_photograph_shows_points_where_a_pinhole_does(width: int)
     radius = 4 * width // 640
     for x, y in lens.project(points):
         cv2.circle(photograph, (round(x * 16), round(y * 16)), radius * 16, (255, 255, 255), -1, cv2.LINE_AA, shift=4)
-    shown = straightened(photograph, lens)
+    shown = straighten(photograph, lens)
     factor = shown.shape[1] / width
     assert shown.shape[1] == min(width, 1600)
     for x, y in factor * (pinhole.project(points) + 0.5) - 0.5:
@@ -76,9 +76,9 @@ def test_a_face_lies_on_the_straightened_photograph(recorded: bool) -> None:
         "is_subject": True,
         "points": pixels.tolist(),
     }
-    straight = straightened_face(face, lens)
+    straight = straighten_face(face, lens)
     np.testing.assert_allclose(straight["points"], wanted, atol=0.06)
     np.testing.assert_allclose(straight["box_px"], [*wanted.min(axis=0), *wanted.max(axis=0)], atol=0.06)
     assert straight["is_subject"]
     beyond = {**face, "points": [[1e6, 1e6]]}
-    assert straightened_face(beyond, camera(LENS))["points"] == [], "no ray of the lens goes there"
+    assert straighten_face(beyond, camera(LENS))["points"] == [], "no ray of the lens goes there"

@@ -50,7 +50,7 @@ def find_scans(folder: Path) -> list[Path]:
 
 def read_scan(path: Path) -> Scan:
     """Returns a scan with its landmarks. Raises InputError if the scan's files cannot be used."""
-    mesh, _ = welded(read_mesh(path))
+    mesh, _ = weld_scan(read_mesh(path))
     landmarks_path = landmark_file(path)
     if landmarks_path is None:
         beside = ", ".join(path.with_suffix(suffix).name for suffix in LANDMARK_SUFFIXES)
@@ -64,7 +64,7 @@ def landmark_file(mesh: Path) -> Path | None:
     return next((path for path in beside if path.is_file()), None)
 
 
-def welded(mesh: Mesh) -> tuple[Mesh, Bool[np.ndarray, " F"]]:
+def weld_scan(mesh: Mesh) -> tuple[Mesh, Bool[np.ndarray, " F"]]:
     """Returns the mesh with each position stored once, without unused vertices, colours and degenerate triangles; also
     a mask of the triangles that remain.
 

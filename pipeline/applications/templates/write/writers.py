@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from pipeline.applications.templates.animated import AnimatedMesh, animated_head, animated_mesh
+from pipeline.applications.templates.animated import AnimatedMesh, animate_head, animate_mesh
 from pipeline.applications.templates.eyeballs import AHEAD, LIMBUS_MM, Eyeball, turn_to
 from pipeline.applications.templates.flame_model import FlameFit, fit_flame
 from pipeline.applications.templates.inner_mouth import TONGUE_OUT, WITH_JAW
@@ -211,7 +211,7 @@ def write_template_shapes(folder: Path, result: Reconstruction, template: Templa
         return
     from_world = head_from_world(result)
     triangles, colours = template.mesh.triangles(), template_colours(result, template)
-    animated = animated_mesh(
+    animated = animate_mesh(
         template.surface_binding,
         triangles,
         from_world.apply(blendshape_rig.neutral_world.vertices),
@@ -244,7 +244,7 @@ def write_posed(folder: Path, result: Reconstruction) -> None:
     shapes = blendshape_rig.moving
     animated = AnimatedMesh(neutral, shapes, {}, {})
     if len(opened) < len(head.faces):
-        animated = animated_head(neutral, opened, shapes, model.landmarks, gazes=_gazes(eyes, from_world))
+        animated = animate_head(neutral, opened, shapes, model.landmarks, gazes=_gazes(eyes, from_world))
     photographed = PhotographedEyes(head, np.arange(len(opened), len(head.faces)), result.texturing.atlas)
     animated = replace(animated, gazes=_towards_irises(animated, eyes, from_world, photographed))
     skin, colours = head_skin(result, head), result.texturing.vertices.colours

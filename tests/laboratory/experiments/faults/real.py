@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline.geometry.projection import depth_map, picture
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
-from pipeline.imaging.masks import eroded
+from pipeline.imaging.masks import erode
 from pipeline.imaging.silhouette import Silhouette, signed_distance
 from pipeline.multiview.scene_tracks import find_scene_points
 from pipeline.reconstruct import reconstruct
@@ -198,7 +198,7 @@ def outline_px(camera: Camera, mesh: Mesh, mask: Bool[np.ndarray, "h w"]) -> flo
     image's border."""
     shown = np.isfinite(depth_map(camera, mesh.vertices, mesh.faces)[0])
     distance = np.abs(signed_distance(mask))
-    rim = shown & ~eroded(shown, 1)
+    rim = shown & ~erode(shown, 1)
     for line in (rim[:2], rim[-2:], rim[:, :2], rim[:, -2:]):
         line[...] = False
     return float(np.median(np.abs(distance[rim] - 0.5))) if rim.any() else float("inf")
@@ -215,7 +215,7 @@ def psnr_db(
     exposure fitted."""
     drawn = picture(camera, mesh.vertices, mesh.faces, colours).astype(np.float64)
     shown = np.isfinite(depth_map(camera, mesh.vertices, mesh.faces)[0])
-    inside = eroded(shown, INSIDE_PX) & (silhouette.distance < -INSIDE_PX) & (image.max(axis=2) < CLIPPED)
+    inside = erode(shown, INSIDE_PX) & (silhouette.distance < -INSIDE_PX) & (image.max(axis=2) < CLIPPED)
     ours, theirs = drawn[inside], image[inside].astype(np.float64)
     if not len(ours):
         return 0.0

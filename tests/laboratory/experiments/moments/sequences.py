@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.applications.moments.footage import TRACKED_PIXELS, Footage, open_footage
-from pipeline.applications.moments.sequence import Course, smoothed, track_sequence
+from pipeline.applications.moments.sequence import Course, smooth_course, track_sequence
 from pipeline.applications.moments.sequence_files import CHUNKS, FILES
 from pipeline.applications.moments.sequence_person import SequencePerson
 from pipeline.head_model.model import HeadModel
@@ -90,7 +90,7 @@ def moving_figures(folder: Path, model: HeadModel, renderer: Renderer, bench: Be
     begun = time.process_time()
     person, raw = track_sequence(footage, model, SETTINGS, kept, renderer=renderer, report=meter)
     assert raw is not None, "there are no other shares"
-    whole, course = time.process_time() - begun, smoothed(raw)
+    whole, course = time.process_time() - begun, smooth_course(raw)
     with np.load(folder / "moving.truth" / "truth.npz") as arrays:
         truth = dict(arrays)
     found, before = (errors(person, each, truth["vertices"], truth["face"]) for each in (course, raw))
@@ -162,7 +162,7 @@ def still_figures(folder: Path, model: HeadModel, renderer: Renderer, bench: Ben
     person, raw = track_sequence(footage, model, SETTINGS, kept, renderer=renderer, report=bench.report)
     assert raw is not None, "there are no other shares"
     face = model.levels["full"].face_region
-    return {"jitter": jitter(person, smoothed(raw), face), "raw_jitter": jitter(person, raw, face)}
+    return {"jitter": jitter(person, smooth_course(raw), face), "raw_jitter": jitter(person, raw, face)}
 
 
 def jitter(person: SequencePerson, course: Course, face: Bool[np.ndarray, " v"]) -> float:

@@ -30,7 +30,7 @@ from pipeline.segmentation import segment as agreement
 from pipeline.segmentation.segment import segment
 from pipeline.settings import FittingSettings, Settings
 from pipeline.view_checks import camera_drift as drift
-from pipeline.view_checks.usable_views import without_moved_cameras
+from pipeline.view_checks.usable_views import exclude_moved_cameras
 from rig.capture import Capture
 from rig.render.renderer import Renderer
 from rig.rig import Rig
@@ -149,7 +149,7 @@ def faulty(kind: str, model: HeadModel, subject: Planted, renderer: Renderer, rn
         masks[first], masks[second] = masks[second], masks[first]
         bad = sorted([first, second])
     silhouettes = segment(Capture({}, {}, masks, {}), rig, report=lambda stage, fraction: None)
-    silhouettes, _ = without_moved_cameras(silhouettes, rig)
+    silhouettes, _ = exclude_moved_cameras(silhouettes, rig)
     left_out = sorted(name for name, silhouette in silhouettes.items() if not silhouette.quality.usable)
     row = fitted(model, subject, silhouettes, rig)
     return row | {"bad": bad, "left_out": left_out, "found": set(bad) <= set(left_out)}

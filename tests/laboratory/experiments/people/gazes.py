@@ -24,7 +24,7 @@ from rig.render.renderer import Renderer
 from rig.studio.scene import eyes as studio_eyes
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
-from rig.studio.scene.subject import Subject, with_gaze
+from rig.studio.scene.subject import Subject, add_eyeballs
 from rig.studio.sensor.preset import PRESET, REALISM, made_real
 from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.shapes import OPEN_TRIANGLES
@@ -59,7 +59,7 @@ def looking_head(model: HeadModel, number: int) -> Subject:
     marks = {name: vertices[row] for name, row in model.landmarks.items()}
     azimuth, elevation = rng.normal(0.0, GAZE_DEG)
     sitter = Subject(Mesh(vertices, faces), marks, model.levels["full"].face_region, f"{model.name}-{number}")
-    return with_gaze(sitter, azimuth, elevation, rng)
+    return add_eyeballs(sitter, azimuth, elevation, rng)
 
 
 def photograph_gaze(model: HeadModel, number: int, renderer: Renderer) -> SimulatedCapture:

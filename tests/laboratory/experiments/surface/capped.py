@@ -36,7 +36,7 @@ from rig.render.renderer import Renderer
 from rig.studio.scene.anatomy import anatomy
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
-from rig.studio.scene.subject import Look, Subject, random_look, restyled
+from rig.studio.scene.subject import Look, Subject, random_look, restyle
 from rig.studio.scene.worn import TightCap, above_edge_mm
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
@@ -155,7 +155,7 @@ def _skull(
     model: HeadModel, population: HeadModel, modes: int, spread: float, number: int, style: str, *, renderer: Renderer
 ) -> Row:
     """Returns the figures of one head's cranium, and whether it is called bald."""
-    shot, scalp = photograph_scalp(population, modes, spread, number, lambda look: restyled(look, [style]), renderer)
+    shot, scalp = photograph_scalp(population, modes, spread, number, lambda look: restyle(look, [style]), renderer)
     settings = Settings(detail="photo", outputs=OutputSettings(surface="head"))
     done = reconstruct(ReconstructionContext(shot.capture, shot.rig, model, settings, renderer))
     found = cranium_figures(shot, scalp, done.mesh_world, done.refined.deviation_mm)

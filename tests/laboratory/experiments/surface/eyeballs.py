@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from pipeline.applications.templates import eyeballs as tested
 from pipeline.applications.templates import pivots as placing
-from pipeline.applications.templates.eyeballs import AHEAD, Eyeball, lifted, placed_eyeballs
+from pipeline.applications.templates.eyeballs import AHEAD, Eyeball, lift_lids, place_eyeballs
 from pipeline.applications.templates.pivots import pivots
 from pipeline.evidence.expression import build_blendshape_rig
 from pipeline.fusion.crossings import crossing_faces
@@ -92,7 +92,7 @@ def turned_gaze(direction: str) -> Float[np.ndarray, " 3"]:
 def place(head: OpenHead, gaze: Float[np.ndarray, " 3"] = AHEAD) -> dict[str, Eyeball]:
     """Returns the eyeballs of a head, both looking along ``gaze``."""
     gazes = dict.fromkeys(head.centres, gaze)
-    return placed_eyeballs(head.vertices, head.faces, head.landmarks, head.centres, gazes)
+    return place_eyeballs(head.vertices, head.faces, head.landmarks, head.centres, gazes)
 
 
 def count_crossings(head: OpenHead, eyes: Mapping[str, Eyeball]) -> tuple[int, int, float]:
@@ -100,7 +100,7 @@ def count_crossings(head: OpenHead, eyes: Mapping[str, Eyeball]) -> tuple[int, i
     and the largest lift (mm)."""
     crossing, lift = 0, 0.0
     for move in head.moves.values():
-        free = lifted(head.vertices, head.faces, move, eyes)
+        free = lift_lids(head.vertices, head.faces, move, eyes)
         lift = max(lift, float(np.linalg.norm(free - move, axis=1).max()))
         crossing += _crossings(head, eyes, free)
     return sum(_crossing(head.vertices, head.faces, eyeball) for eyeball in eyes.values()), crossing, lift

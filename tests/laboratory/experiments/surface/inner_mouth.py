@@ -17,9 +17,9 @@ from pipeline.applications.templates.inner_mouth import (
     WEIGHTS,
     InnerMouth,
     jaw_weight,
-    kept_off_teeth,
+    keep_off_teeth,
     meeting_triangles,
-    placed_inner_mouth,
+    place_inner_mouth,
 )
 from pipeline.applications.templates.pivots import jaw_motions
 from pipeline.head_model.model import HeadModel
@@ -44,7 +44,7 @@ def inner_mouths(facekit: HeadModel, *, bench: Bench) -> Outcome:
 def _row(model: HeadModel, number: int) -> Row:
     head, inner = _case(model, number)
     vertices, faces, moves = head.vertices, head.faces, head.moves
-    free = kept_off_teeth(vertices, faces, moves, inner)
+    free = keep_off_teeth(vertices, faces, moves, inner)
     lift = {name: float(np.linalg.norm(free[name] - moves[name], axis=1).max()) for name in moves}
     return {
         "parts": len(inner.parts),
@@ -63,7 +63,7 @@ def _case(model: HeadModel, number: int) -> tuple[OpenHead, InnerMouth]:
     head = open_head(model, number)
     head = replace(head, moves={TONGUE_OUT: np.zeros_like(head.vertices), **head.moves})
     loose, jaw = np.full(len(head.vertices), -1), jaw_motions(head.landmarks, head.vertices, head.moves)
-    return head, placed_inner_mouth(head.vertices, head.faces, head.moves, head.landmarks, jaw, loose)
+    return head, place_inner_mouth(head.vertices, head.faces, head.moves, head.landmarks, jaw, loose)
 
 
 def _posed(vertices: Float[np.ndarray, "v 3"], moves: Moves, name: str, weight: float) -> Float[np.ndarray, "v 3"]:

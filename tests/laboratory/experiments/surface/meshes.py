@@ -61,7 +61,7 @@ def meshes(
 
 
 class RandomHeads:
-    """Draws heads of a model, and measures what ``untangled`` makes of each."""
+    """Draws heads of a model, and measures what ``untangle`` makes of each."""
 
     def __init__(self, model: HeadModel) -> None:
         self._model, self._topology, self._rest = model, head_topology(model), clean_mean_head(model)
@@ -74,7 +74,7 @@ class RandomHeads:
         if kind == "displaced":
             vertices += self._displacement(rng)[:, None] * vertex_normals(vertices, self._topology.faces)
         began = time.process_time()
-        clean = untangling.untangled(vertices, self._topology, self._rest)
+        clean = untangling.untangle(vertices, self._topology, self._rest)
         cpu_s = time.process_time() - began
         moved_mm = np.linalg.norm(clean - vertices, axis=1)
         return {

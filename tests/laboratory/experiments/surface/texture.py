@@ -29,7 +29,7 @@ from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
 from pipeline.texturing.layout.uv_unwrap import Layout, model_layout
 from pipeline.texturing.paint import paint_head
-from pipeline.texturing.vertex_colours import texture as colour
+from pipeline.texturing.vertex_colours import colour_vertices as colour
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear

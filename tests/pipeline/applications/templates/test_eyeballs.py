@@ -8,7 +8,7 @@ import trimesh
 from trimesh.util import wrap_as_stream
 
 from pipeline.applications.templates.animated import AnimatedMesh
-from pipeline.applications.templates.eyeballs import Eyeball, lifted, placed_eyeballs, turn_to
+from pipeline.applications.templates.eyeballs import Eyeball, lift_lids, place_eyeballs, turn_to
 from pipeline.applications.templates.write.writers import animated_scene
 from pipeline.fusion.crossings import crossing_faces
 from rig.formats.meshes.glb import scene_glb_bytes
@@ -68,7 +68,7 @@ def test_an_eyeball_is_closed_and_has_a_cornea_where_it_looks(gaze: tuple[float,
 
 def test_a_ball_lies_right_behind_open_lids_and_where_an_eye_is_closed_there_is_none() -> None:
     vertices, faces, _, marks = lids(slit=True)
-    found = placed_eyeballs(vertices, faces, marks, CENTRES)
+    found = place_eyeballs(vertices, faces, marks, CENTRES)
     assert set(found) == {"eye_left"}
     eyeball = found["eye_left"]
     np.testing.assert_allclose(eyeball.centre[:2], CENTRES["eye_left"][:2])
@@ -77,29 +77,29 @@ def test_a_ball_lies_right_behind_open_lids_and_where_an_eye_is_closed_there_is_
     ahead = Eyeball(eyeball.centre + (0.0, 0.0, 0.6), AHEAD)
     assert crossing(vertices, faces, ahead) > 0
     closed, whole, _, _ = lids(slit=False)
-    assert placed_eyeballs(closed, whole, marks, CENTRES) == {}
+    assert place_eyeballs(closed, whole, marks, CENTRES) == {}
 
 
 @pytest.mark.parametrize("gaze", [(0.0, 0.0), (0.26, 0.0), (-0.26, 0.0), (0.0, 0.26), (0.0, -0.26)])
 def test_a_lid_closes_over_the_ball_without_crossing_it(gaze: tuple[float, float]) -> None:
     vertices, faces, down, marks = lids(slit=True)
     towards = np.array([*gaze, np.sqrt(1.0 - np.square(gaze).sum())])
-    eyes = placed_eyeballs(vertices, faces, marks, CENTRES, {"eye_left": towards})
+    eyes = place_eyeballs(vertices, faces, marks, CENTRES, {"eye_left": towards})
     eyeball = eyes["eye_left"]
     assert any(gaze) or crossing(vertices + 0.5 * down, faces, eyeball) > 0  # a cornea below the slit lies deeper
-    free = lifted(vertices, faces, down, eyes)
+    free = lift_lids(vertices, faces, down, eyes)
     for weight in (0.0, 0.5, 1.0):
         assert crossing(vertices + weight * free, faces, eyeball) == 0
     still = np.linalg.norm(down, axis=1) < 1e-9
     assert not (free - down)[still].any()
     assert np.linalg.norm(free - down, axis=1).max() < 3.0
-    np.testing.assert_array_equal(lifted(vertices, faces, np.zeros_like(down), eyes), 0.0)
+    np.testing.assert_array_equal(lift_lids(vertices, faces, np.zeros_like(down), eyes), 0.0)
 
 
 def test_an_added_eyeball_is_a_part_that_turns_about_its_centre_to_where_the_eye_looks() -> None:
     vertices, faces, down, marks = lids(slit=True)
     gaze = np.array([0.25, -0.1, 0.96]) / np.linalg.norm([0.25, -0.1, 0.96])
-    eyes = placed_eyeballs(vertices, faces, marks, CENTRES, {"eye_left": gaze})
+    eyes = place_eyeballs(vertices, faces, marks, CENTRES, {"eye_left": gaze})
     assert crossing(vertices, faces, eyes["eye_left"]) == 0
     points = {name: eyeball.centre for name, eyeball in eyes.items()} | {"neck": np.zeros(3)}
     animated = AnimatedMesh(vertices, {"eyeBlinkLeft": down}, points, {}, eyes, gazes={"eye_left": gaze})

@@ -6,10 +6,10 @@ import pytest
 from pipeline.applications.templates.animated import AnimatedMesh
 from pipeline.applications.templates.inner_mouth import (
     InnerMouth,
-    kept_off_teeth,
+    keep_off_teeth,
     load_inner_mouth,
     meeting_triangles,
-    placed_inner_mouth,
+    place_inner_mouth,
 )
 from pipeline.applications.templates.pivots import hinge, jaw_motions
 from pipeline.applications.templates.write.writers import animated_scene
@@ -43,7 +43,7 @@ def placed(
         skin, loose = np.concatenate([skin, more]), np.append(loose, np.full(len(more), -1 if joined else 0))
         shapes = {name: np.concatenate([shape, np.zeros_like(more)]) for name, shape in shapes.items()}
     full = {"jawOpen": model.levels["full"].operator @ model.expressions.moved({"jawOpen": 1.0})}
-    return placed_inner_mouth(skin, faces, shapes, marks, jaw_motions(marks, mean, full), loose)
+    return place_inner_mouth(skin, faces, shapes, marks, jaw_motions(marks, mean, full), loose)
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def test_lips_that_are_pressed_in_keep_off_the_teeth(
     name = "mouthPressLeft"
     before = meeting_triangles(skin + shapes[name], faces, inner.posed(name, 1.0), inner)
     assert before.any()
-    free = kept_off_teeth(skin, faces, shapes, inner)
+    free = keep_off_teeth(skin, faces, shapes, inner)
     for weight in (0.5, 1.0):
         assert not meeting_triangles(skin + weight * free[name], faces, inner.posed(name, weight), inner).any()
     assert free["browInnerUp"] is shapes["browInnerUp"]

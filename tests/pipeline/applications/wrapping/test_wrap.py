@@ -12,7 +12,7 @@ from pipeline.applications.templates.template_file import Template
 from pipeline.applications.wrapping.scan import raw_scan, read_raw_scan
 from pipeline.applications.wrapping.wrap import (
     PlacedScan,
-    drawn_onto,
+    deform_onto,
     nearest_axis,
     place_scan,
     residual_colours,
@@ -87,7 +87,7 @@ def test_a_template_lies_on_the_scan_it_was_drawn_to(model: HeadModel, template:
     bump = np.exp(-0.5 * np.array(squares) / 20.0**2).sum(axis=0)
     scan = Surface.of(mean + 3.0 * bump[:, None] * scan.normals, faces)
     carried = template.surface_binding.on(mean, faces)
-    drawn, met = drawn_onto(carried, template, model, scan)
+    drawn, met = deform_onto(carried, template, model, scan)
     index, skin = SurfaceIndex(scan.vertices, scan.faces), template.surface_binding.skin
     before, after = (index.closest(points[skin]).distances for points in (carried, drawn))
     assert before.max() > 2.5

@@ -11,9 +11,9 @@ from pipeline.segmentation.without_plates.decide import (
     NEAR,
     ball_above,
     decision_without_plate,
-    estimated_background,
+    find_standing_plane,
+    guess_background,
     plate_noise,
-    standing_plane,
 )
 from pipeline.segmentation.without_plates.mask_search import CoarseMask
 from pipeline.segmentation.without_plates.viewing_volume import OtherViews
@@ -61,7 +61,7 @@ def test_a_smooth_background_is_guessed_where_the_border_is_and_texture_makes_th
     for texture in (0.0, 12.0):
         image, plate, away = photograph(texture)
         small, from_edge = coarse_of(image, away)
-        guesses[texture] = estimated_background(image, small, from_edge > 6), plate, np.abs(away) < 4
+        guesses[texture] = guess_background(image, small, from_edge > 6), plate, np.abs(away) < 4
     guess, plate, rim = guesses[0.0]
     assert np.abs(guess.plates[0][rim].astype(float) - plate[rim]).max() < 3  # 12 px of 0.05 levels, and noise
     assert np.median(guess.noise) < 3
@@ -117,7 +117,7 @@ def test_a_table_is_found_under_a_head_and_what_stands_on_it_has_the_heads_size(
     rng = np.random.default_rng(1)
     head_and_table = np.vstack([head(rng), table(rng, 0.5)])
     points = np.vstack([head_and_table, CENTRE + rng.uniform(-2000, 2000, size=(100, 3))])
-    plane = standing_plane(points, CENTRE, BALL_RADIUS)
+    plane = find_standing_plane(points, CENTRE, BALL_RADIUS)
     assert plane is not None
     # 200 points of 0.5 mm over 250 mm: 0.035 mm of height, 0.02 degrees; ten of each.
     assert abs(plane[:3] @ CENTRE + plane[3] - 70) < 0.35
@@ -129,8 +129,8 @@ def test_a_table_is_found_under_a_head_and_what_stands_on_it_has_the_heads_size(
 
 def test_a_person_alone_stands_on_nothing_nor_on_a_table_through_the_middle() -> None:
     rng = np.random.default_rng(3)
-    assert standing_plane(head(rng), CENTRE, BALL_RADIUS) is None
+    assert find_standing_plane(head(rng), CENTRE, BALL_RADIUS) is None
     walls = CENTRE + rng.normal(size=(300, 3)) * 150  # a room with things in it everywhere
-    assert standing_plane(np.vstack([head(rng), walls]), CENTRE, BALL_RADIUS) is None
+    assert find_standing_plane(np.vstack([head(rng), walls]), CENTRE, BALL_RADIUS) is None
     half = table(rng, 0.5) + np.array([0.0, 30.0, 0.0])  # 40 mm below the middle: a tenth of the head is under it
-    assert standing_plane(np.vstack([head(rng), half]), CENTRE, BALL_RADIUS) is None
+    assert find_standing_plane(np.vstack([head(rng), half]), CENTRE, BALL_RADIUS) is None

@@ -14,7 +14,7 @@ from pipeline.texturing.pores.relief import (
     Strips,
     TexelFrames,
     estimate_detail,
-    without_slow,
+    remove_slow,
 )
 from pipeline.texturing.pores.skin_maps import plain_choice
 from pipeline.texturing.visibility import window_table
@@ -123,6 +123,6 @@ def test_slow_waves_are_those_of_a_gaussian(side: int) -> None:
     light = np.random.default_rng(side).standard_normal((side, 9 * side)).astype(np.float32)
     light += np.linspace(0.0, 30.0, 9 * side, dtype=np.float32)
     plain = light - cv2.GaussianBlur(light, (0, 0), side / 6.0, borderType=cv2.BORDER_REFLECT)
-    found = without_slow(light, side)
+    found = remove_slow(light, side)
     assert found.std() == pytest.approx(1.0, rel=0.05)
     assert np.abs(found - plain)[:, side:-side].max() < 0.005 * plain.std()

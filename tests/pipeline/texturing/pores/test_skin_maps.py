@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
 from pipeline.texturing.pores.relief import COARSE, TexelFrames
-from pipeline.texturing.pores.skin_maps import MID_CODE, MM_PER_CODE, codes_of, normal_codes, sharpened_atlas
+from pipeline.texturing.pores.skin_maps import MID_CODE, MM_PER_CODE, codes_of, normal_codes, sharpen_atlas
 from rig.colour_space import linear_from_srgb
 
 SIZE, IMAGE_MM = 64, 32.0
@@ -34,7 +34,7 @@ def test_brightness_multiplies_the_light_of_a_texture() -> None:
     image = np.full((4, 4, 3), 100, np.uint8)
     brightness = np.zeros((4, 4), np.float16)
     brightness[1, 2] = np.log(1.5)
-    found = sharpened_atlas(Atlas(layout, image), brightness).image
+    found = sharpen_atlas(Atlas(layout, image), brightness).image
     assert (found[0] == 100).all()
     ratio = linear_from_srgb(found[1, 2] / 255.0) / linear_from_srgb(np.array(100 / 255.0))
     np.testing.assert_allclose(ratio, 1.5, rtol=0.02)

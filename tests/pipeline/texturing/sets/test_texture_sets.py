@@ -14,7 +14,7 @@ from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from pipeline.texturing.paint import paint_texture
 from pipeline.texturing.sets.specular import exposure_ratios
 from pipeline.texturing.sets.texture_sets import SetTextures, colour_by_sets
-from pipeline.texturing.vertex_colours import texture
+from pipeline.texturing.vertex_colours import colour_vertices
 from pipeline.texturing.visibility import Decision
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
@@ -84,7 +84,7 @@ def shiny(renderer) -> Coloured:
     layout = ModelLayout(
         unwrap(mesh.vertices, mesh.faces), Neighbourhood.of(*neighbours(mesh.faces, len(mesh.vertices)))
     )
-    found = texture(
+    found = colour_vertices(
         mesh, taken.capture, silhouettes, rig, depth_maps(rig, mesh), settings=SETTINGS, around=layout.around
     )
     assert found.decision is not None
