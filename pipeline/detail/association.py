@@ -1,8 +1,8 @@
 """Assigns each measured surface point to the closest point of the head with a similar normal, and makes observations
 of the head from these pairs.
 
-The search for pairs goes from the measured points to the head. With this direction, parts of the head without measured
-points, and the borders of such holes, get no observation.
+The search for pairs goes from the measured points to the head, so parts of the head without measured points, and the
+borders of such holes, get no observation.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,8 @@
 """Measures the depth bias that matching windows cause (``pipeline.stereo.depth_map``) on the fitted face of each
 capture. The fitted face is a good reference, since it was fitted with patches that follow the surface.
 
-On captures from two renderers the surface was 0.0 to 0.15 mm too deep, and the slope ``share`` was 0.7 to 1.5. The
-fitted face and the true face gave the same slope to 0.1.
+On captures from two renderers the measured surface was 0.0 to 0.15 mm too deep, and the slope ``share`` was 0.7 to 1.5.
+The fitted face and the true face gave the same slope to 0.1.
 """
 
 from dataclasses import dataclass, replace

@@ -3,7 +3,7 @@
 The pixels between the lids show whether an eye is open: the white of an eye is grey, and iris and pupil are darker than
 skin. A closed lid is skin with a thin line of lashes. A blink expression of the model closes the lids. In a model
 without such an expression, a smooth surface bridges the opening and replaces the lids' margins (biharmonic; Botsch and
-Kobbelt 2004, *An intuitive framework for real-time freeform modeling*). Later steps deform this bridge to the measured
+Kobbelt 2004, *An intuitive framework for real-time freeform modeling*). Later steps deform the bridge to the measured
 lids. The model's eyeball stays hidden behind the bridge.
 """
 

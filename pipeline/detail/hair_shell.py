@@ -1,8 +1,8 @@
 """Moves vertices of the head outwards to the bust's surface where the bust is hair.
 
-Every vertex moves along a direction that is smooth over the head, up to the bust's hair in this direction. No vertex
-ends inside the skin. The mesh retains the head's vertex order, so templates can be bound to it. Hair that hangs beside
-the head is not covered, since the head has no vertices for it.
+Every vertex moves along the head's smoothed normal at this vertex, until it meets the bust's hair. No vertex ends
+inside the skin. The mesh retains the head's vertex order, so templates can be bound to it. Hair that hangs beside the
+head is not covered, since the head has no vertices for it.
 """
 
 from dataclasses import dataclass

@@ -1,9 +1,9 @@
 """Computes observations of the deformed head from the silhouettes' outlines.
 
 On smooth and shiny skin dense matching follows highlights, which lie behind a convex surface, so the tip of the nose
-comes out 2 to 3 mm too deep. In profile the silhouettes show this tip to half a pixel. At the rim the surface's normal
-is parallel to the image, so the signed distance to the silhouette is an offset along the normal. Only the face's rim is
-used. Pixels of hair reduce the rim's weight, since the outline of hair is not that of skin.
+comes out 2 to 3 mm too deep. In profile the silhouettes show the tip of the nose to half a pixel. At the rim the
+surface's normal is parallel to the image, so the signed distance to the silhouette is an offset along the normal. Only
+the face's rim is used. Pixels of hair reduce the rim's weight, since the outline of hair is not that of skin.
 """
 
 from collections.abc import Callable, Sequence

@@ -65,8 +65,8 @@ def _crossing(
 @traced
 def separate_coincidences(mesh: Mesh) -> Mesh:
     """Separates vertices that coincide in single precision, as files store them, by a small move towards the mean of
-    their neighbours. Without this shift, a program that merges vertices by position would join separate sheets of the
-    surface."""
+    their neighbours. If two vertices coincided, a program that merges vertices by position would join separate sheets
+    of the surface."""
     stored = mesh.vertices.astype(np.float32)
     order = np.argsort(stored[:, 0])  # only what is equal there is sorted by all coordinates: a tenth of the time
     again = np.diff(stored[order, 0]) == 0.0

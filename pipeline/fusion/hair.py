@@ -3,11 +3,11 @@
 In hair, dense matching finds chance patterns of strands. The depth of hair therefore scatters over millimetres, and the
 fused surface would be rough, with pockets and handles. Therefore depth of hair gets a small weight in the signed
 distance (``loosen_hair``), and hair vertices are smoothed. Matching also looks through strands to the dense core of the
-hair or to the scalp. Therefore hair at the silhouettes' rims is moved outwards until it is as far inside all
-silhouettes as visible strands. Hair with a smooth surface has depth nearly everywhere, and is not changed.
+hair or to the scalp, so hair at the silhouettes' rims is moved outwards until it is as far inside all silhouettes as
+visible strands. Hair with a smooth surface has depth nearly everywhere, and is not changed.
 
-Long hair often has hardly any measured depth. Long hair without depth is modelled as a smooth shell inside the visual
-hull, whose distance from the hull is estimated from the few measured points.
+Long hair with hardly any measured depth is modelled as a smooth shell inside the visual hull. The shell's distance from
+the hull is estimated from the few measured points.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,7 @@
 """Predicts the surface where hardly any camera sees it, from the fitted head and the visual hull. The offsets of head
 and hull from the surface are extrapolated from regions that cameras see.
 
-The predictor that lies nearer to the seen surface in the neighbourhood gets more weight. The hull is exact to a
+Of head and hull, the one nearer to the seen surface around a point has more weight there. The hull is exact to a
 millimetre around a skull, where the fitted head may be 6 to 12 mm too deep. Below brows and chin, and with all cameras
 on one side, the head is better.
 """
@@ -105,6 +105,6 @@ def near_rim(head_world: Mesh, places: Float[np.ndarray, "n 3"], within_mm: floa
 
 
 def below_head(head_world: Mesh, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Returns a mask of the points beyond the head's open border: their nearest head vertex is near it."""
+    """Returns a mask of the points whose nearest head vertex lies near the head's open border."""
     vertices = head_world.vertices[::EVERY]
     return near_rim(head_world, vertices)[nearest(PointTree.of(vertices), places)[1]]

@@ -209,7 +209,7 @@ class HeadEars:
             around += [head_world.vertices[ear], placed[ear]]
         return cls(Mesh(placed, head_world.faces), np.concatenate(around))
 
-    def among(self, grid: Grid, votes: Votes, start: Field) -> tuple[Votes, Field]:
+    def replace_votes(self, grid: Grid, votes: Votes, start: Field) -> tuple[Votes, Field]:
         """Removes the votes near the ears, and sets the start field near the ears to the distance to the head."""
         rows, distance = distance_about_ears(self.head_world, self.around, grid.places())
         inner = ~grid.outer[rows]
@@ -251,7 +251,7 @@ def solve(
         mixed = outside * np.maximum(shell, votes.bound) + (1.0 - outside) * guess
         guess = np.where(grid.outer | (votes.weight >= WEAK), guess, mixed).astype(np.float32)
     if ears is not None:
-        votes, guess = ears.among(grid, votes, guess)
+        votes, guess = ears.replace_votes(grid, votes, guess)
         seen = np.concatenate([seen, ears.around])
     level = solve_level(grid, votes, guess, SWEEPS, FACTOR)
     box = level.field.reshape(grid.shape)
@@ -278,7 +278,7 @@ def _finer(
         start = grid_kernels.interpolated(box, grid.index)
         votes = add_bust_end(combine_views(grid, views), grid, cut)
         if ears is not None:
-            votes, start = ears.among(grid, votes, start)
+            votes, start = ears.replace_votes(grid, votes, start)
         level = solve_level(grid, votes, start, FINE_SWEEPS, FINE_FACTOR)
         if not grid_kernels.crossed_at_rim(level.field, grid.neighbours, grid.outer):
             return level

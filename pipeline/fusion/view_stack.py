@@ -1,8 +1,8 @@
 """Packs the depth maps of all views, and signed distances to the outlines, into flat arrays for compiled loops.
 
 The subject's surface lies inside every silhouette. If depth points of two views fall outside the silhouette of a third
-view, this silhouette is ignored there, so that a bad mask cuts no hole. Close to an outline the depth itself may be
-wrong, since matching windows make thin things (frames of glasses, the edge of a collar) wider.
+view, this silhouette is ignored there, so that a bad mask cuts no hole. Points close outside an outline contradict
+nothing, since matching windows make thin things (frames of glasses, the edge of a collar) wider.
 """
 
 from collections.abc import Mapping, Sequence

@@ -232,8 +232,8 @@ def _without_specks(
     """Keeps only the subject's connected component in alpha, and fills holes from noise. Returns alpha and the number
     of remaining holes.
 
-    A small hole is noise. A larger hole is noise if the ``coarse`` probability, in which the sensor's noise is
-    averaged, is high in all of it. Holes from noise occur if skin has the colour of the backdrop.
+    A small hole counts as noise. A larger hole counts as noise if the ``coarse`` probability, in which the sensor's
+    noise is averaged, is high in the whole hole. Holes from noise occur if skin has the colour of the backdrop.
     """
     mask = alpha > 0.5
     labels, areas = _labelled(mask, 4)

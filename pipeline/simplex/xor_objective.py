@@ -13,8 +13,8 @@ to the face region (ear to ear, forehead to chin); all other pixels have weight 
 each mesh, from the head at the start of its search, so that the cost during the search is a fixed function of the
 coefficients: eq. (5) with some weights zero. ``speaking="all"`` gives exactly the paper's cost.
 
-The cut through the neck has no weight, so triangles close it and back faces need not be drawn, which saves 5 of 19 ms
-in each evaluation. If the neck's cut is not flat, the closing triangles add a thousandth of the silhouette's area."""
+Pixels at the neck's cut have no weight, so triangles close the mesh there and back faces need not be drawn, which saves
+5 of 19 ms in each evaluation. If the cut is not flat, these triangles add a thousandth of the silhouette's area."""
 
 from collections.abc import Mapping
 from itertools import pairwise

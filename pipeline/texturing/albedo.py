@@ -83,7 +83,7 @@ def shine_left(
     a highlight has the hue of its lamp, and the hue in a dark view is mostly noise."""
     ratio = dim.sum(axis=1) / np.maximum(shown.sum(axis=1), 1e-4)
     ratio = np.where(seen, ratio, 1.0)
-    ratio = around.calmed(ratio[:, None], CALM)[:, 0]
+    ratio = around.smooth(ratio[:, None], CALM)[:, 0]
     # Between its views every vertex differs by noise: what most of the head has is no highlight.
     ordinary = float(np.median(ratio[seen])) if seen.any() else 1.0
     return np.clip(ratio / max(ordinary, 1e-4), 1.0 - MAX_SHINE, 1.0)

@@ -7,7 +7,7 @@ itself blocks (Sloan, Kautz and Snyder, *Precomputed Radiance Transfer*, SIGGRAP
 
 The skin of the face is assumed to have the same colour everywhere; brows, lips and beards are treated as outliers. A
 dark head in bright light and a bright head in dim light look the same, so the light's mean over the sphere is fixed at
-1 in each channel. From directions that no part of the face sees, the light is estimated close to that mean.
+1 in each channel. Light from directions that no part of the face sees is estimated close to 1.
 """
 
 from dataclasses import dataclass
@@ -101,7 +101,7 @@ def transfer(
     hidden = np.zeros_like(unhidden)
     for facing, part in map_in_threads(hide, directions):  # in order, so that the sum has the same bits on any machine
         hidden[facing] += part
-    return unhidden - (1.0 - RETURNED) * around.calmed(hidden, CALM)
+    return unhidden - (1.0 - RETURNED) * around.smooth(hidden, CALM)
 
 
 def _lamp_camera(mesh: Mesh, towards: Float[np.ndarray, " 3"]) -> Camera:

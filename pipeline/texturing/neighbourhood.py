@@ -40,7 +40,7 @@ class Neighbourhood:
         """Returns, for each entry of ``indices``, the vertex whose neighbour it is."""
         return np.repeat(np.arange(len(self.starts) - 1, dtype=np.int32), np.diff(self.starts))
 
-    def calmed(self, values: Float[np.ndarray, "v c"], rounds: int) -> Float[np.ndarray, "v c"]:
+    def smooth(self, values: Float[np.ndarray, "v c"], rounds: int) -> Float[np.ndarray, "v c"]:
         """Smooths values over the mesh: in each round a vertex's value becomes the average of itself and its
         neighbours' mean."""
         count = len(self.starts) - 1

@@ -69,8 +69,8 @@ def sample(pictures: Pictures, k: int, x: float, y: float, out: np.ndarray) -> N
 def gather(
     corners: tuple[int, int, int], choice: Choice, view: np.ndarray, share: np.ndarray, added: np.ndarray
 ) -> int:  # fmt: skip
-    """Collects the views that colour a triangle: each was chosen at one corner and sees all three. Returns the number n
-    of these views.
+    """Collects the views that colour a triangle: those that see all three corners and were chosen at one. Returns the
+    number n of these views.
 
     Fills ``view`` (n), ``share`` (n, 3), the weight of each view at each corner, and ``added`` (3, 3), the correction
     (codes, RGB) at each corner.

@@ -115,13 +115,13 @@ class Shown:
     """Holds what limits the use of each view: occluding hair, labelled parts, measured depth.
 
     Attributes:
-        likely: the part (a code of ``Part``) of each vertex if nobody sees it; ``HAIR`` is the scalp, bald or not.
+        likely: the part (a code of ``Part``) of each vertex if no view sees it; ``HAIR`` is the scalp, bald or not.
         shares: gives for a camera the probabilities (0 to 1) of skin, hair and clothes at the chosen vertices.
-        hairless: where hair hides the surface, which is a bare head's; None: hair belongs to the surface.
-        face: where what is of no part is a mouth or a nostril, and not a backdrop.
+        hairless: where the surface is bare skin, which hair may hide; None: hair belongs to the surface.
+        face: where a pixel of no part shows a mouth or a nostril, and not the backdrop.
         measured: where depth agrees with the surface; None: everywhere.
-        compared: regions of the face over which views of one moment look alike.
-        best_views: whether detail is taken, without a mesh's edges, from the view that sees a vertex best.
+        compared: regions of the face that look alike in all views of one moment.
+        best_views: whether a vertex takes its detail from its best view if no mesh edges are given.
     """
 
     likely: UInt8[np.ndarray, " v"]

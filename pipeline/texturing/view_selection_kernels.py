@@ -210,7 +210,7 @@ def blend_views(weights: np.ndarray, colours: np.ndarray, outlier: float) -> tup
     linear.
 
     ``outlier`` is the difference from the median, relative to the median, at which a brighter view (a highlight) counts
-    half. A darker view (in a shadow that only it sees) counts half at twice that.
+    half. A darker view, which may show a shadow, counts half at twice this difference.
     """
     cameras, count = weights.shape
     out = np.zeros((count, 3))

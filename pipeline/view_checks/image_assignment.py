@@ -1,8 +1,8 @@
 """Assigns every picture to the camera that took it, before any measurement in the pictures.
 
 The module returns capture and silhouettes under the right cameras, and the exchanges found. Another camera's clean
-plate gives no useful mask, so plates are first matched to pictures by their common background. After this match the
-pictures, with their plates, are matched to cameras (``pipeline.view_checks.camera_assignment``).
+plate gives no useful mask, so plates are first matched to pictures by their common background. Pictures with their
+plates are then matched to cameras (``pipeline.view_checks.camera_assignment``).
 """
 
 from collections.abc import Callable, Mapping, Sequence

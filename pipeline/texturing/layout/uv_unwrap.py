@@ -9,8 +9,8 @@ theorem). Parts that become too small in the layout (nose, ears) are enlarged by
 The layout is computed from a head model's mean head, so that a texel shows the same place of every subject's head.
 
 The bust's mesh, in contrast, is divided into several UV charts. Each triangle is projected along one of six directions
-(the head's axes), the one that the surface around it faces. If one part of the surface hides another (an ear the head),
-the hidden part gets a chart of its own. Charts are packed in rows of equal height.
+(the head's axes), the one that the surface around it faces. If one part of the surface hides another, as an ear hides
+the head, the hidden part gets a chart of its own. Charts are packed in rows of equal height.
 """
 
 from dataclasses import dataclass

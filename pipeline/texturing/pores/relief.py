@@ -3,8 +3,8 @@
 A relief h changes the logarithm of the diffuse shading by ``-g . grad h``. The vector g is the tangential gradient of
 the shading by the normal, divided by the shading (Pentland, *Linear shape from shading*, IJCV 1990). In a patch of
 skin, a few millimetres wide, shading multiplies each Fourier component of the relief by a constant factor, so the
-shading can be inverted to the relief. Waves at right angles to g do not change the shading, so their height is
-estimated near zero.
+shading can be inverted to the relief. Waves of the relief at right angles to g do not change the shading, so their
+height is estimated near zero.
 
 Pictures have noise and highlights, and the geometry and the cameras are off by a pixel. Therefore the views are split
 into two disjoint sets, and the image shift between the sets is removed. For each patch and octave of wavelength, a

@@ -43,8 +43,8 @@ class CloseViews:
     """Holds the full-size pictures of some views, packed into one array.
 
     Attributes:
-        views: the cameras that take just these pictures.
-        rows: of these views in the ``decision``.
+        views: cameras of the cropped pictures.
+        rows: indices of these views in the ``decision``.
         pictures: packed as those of work size.
         decision: which views of work size colour each vertex.
     """

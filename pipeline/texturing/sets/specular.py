@@ -45,8 +45,8 @@ class Specular:
 
     Attributes:
         light: linear, in the textures' units: the mean over the views that see a texel, 0 where none does.
-        exposure: of the parallel picture by that of the crossed one, by camera.
-        negative: light below zero by that above, before it is cut off: what noise and motion leave.
+        exposure: of the parallel picture, divided by that of the crossed picture, by camera.
+        negative: light below zero, which noise and motion cause, divided by the light above zero.
         exchanged: whether the crossed pictures show the mirrored light.
     """
 

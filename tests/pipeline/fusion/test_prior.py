@@ -94,6 +94,6 @@ def test_an_ear_is_laid_towards_its_outlines_and_replaces_fragments_of_depth() -
     box = whole_box(np.array([30.0, -20.0, -20.0]), np.array([60.0, 40.0, 40.0]), 3.0)
     height = (box.places()[:, 0] - 40.0).astype(np.float32)  # fragments that depth shows 20 mm too deep
     votes = Votes(height, np.full(len(box), 20.0, np.float32), np.full(len(box), -20.0, np.float32))
-    level = solve_level(box, *ears.among(box, votes, height), SWEEPS, FACTOR)
+    level = solve_level(box, *ears.replace_votes(box, votes, height), SWEEPS, FACTOR)
     last = np.flatnonzero(level.field.reshape(box.shape)[:, 6, 6] < 0.0).max()
     assert box.corner[0] + box.step_mm * last == pytest.approx(ears.head_world.vertices[ear, 0].max(), abs=3.1)
