@@ -19,7 +19,7 @@ from calibration.adjustment.state import (
     BundleState,
     Observations,
     camera_of,
-    observations,
+    observe_views,
     orthonormal,
     residuals,
 )
@@ -144,7 +144,7 @@ def _adjust(graph: Graph, detections: Detections, lenses: dict[str, Lens], repor
         report("bundle", min(0.9, len(dropped) / 10))
 
     for attempt in range(ROUNDS):
-        observed = observations(views, names, graph.shots, detections.board)
+        observed = observe_views(views, names, graph.shots, detections.board)
         if attempt == 0:
             for scale in (8.0, 2.0):
                 sigma = np.sqrt(noise**2 + 0.25) * scale
@@ -185,7 +185,7 @@ def _finish(
     if contradicting:
         raise CalibrationRefused([*contradicting, *(drop.message() for drop in dropped[:5])])
     state, shots = _take_shots(state, graph.shots, {view.shot for view in views})
-    everything = observations(views, names, shots, detections.board)
+    everything = observe_views(views, names, shots, detections.board)
     sigma, _ = corner_sigma(state, everything, noise)
     prior = _prior(weak, names, lenses, noise, sigma)
     offsets = estimate_offsets(state, everything, prior, sigma)

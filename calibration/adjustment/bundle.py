@@ -186,14 +186,14 @@ def adjust(
     offsets. ``loss`` is the robust loss of |r|^2 / sigma^2; the default is least squares. ``steps`` is the largest
     number of steps. ``tick`` is called before every step; an exception raised by ``tick`` ends the adjustment.
     """
-    problem = bundle_problem(state, CornerTerm(observed, sigma, loss or LeastSquares()), prior, free or Free())
+    problem = build_bundle_problem(state, CornerTerm(observed, sigma, loss or LeastSquares()), prior, free or Free())
     limits = Limits(steps=steps, tolerance=TOLERANCE, tries=6, first_damping=1e-4)
     solution = minimise(problem, state, limits, watch=tick)
     assert problem.free is not None
     return BundleSolution(solution.value, problem.equations(solution.at).matrix, problem.free, solution.evidence)
 
 
-def bundle_problem(state: BundleState, corners: CornerTerm, prior: LensPrior, free: Free) -> Problem[BundleState]:
+def build_bundle_problem(state: BundleState, corners: CornerTerm, prior: LensPrior, free: Free) -> Problem[BundleState]:
     """Builds the least-squares problem from the corner term, the lens priors and the prior of square pixels."""
     mask = free_mask(state, free)
     return Problem((corners, prior, AspectTerm()), len(mask), moved_state, mask)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from calibration.adjustment.bundle import CAUCHY, BundleSolution, adjust
 from calibration.adjustment.lens_prior import weak_prior
-from calibration.adjustment.state import INTRINSICS, BundleState, intrinsics_of, observations, orthonormal, residuals
+from calibration.adjustment.state import INTRINSICS, BundleState, intrinsics_of, observe_views, orthonormal, residuals
 from calibration.board.board import Board
 from calibration.board.corners import Found
 from calibration.board.detection import Detections, View
@@ -70,7 +70,7 @@ def estimate_lenses(detections: Detections) -> dict[str, Lens]:
 def estimate_lens(views: Sequence[View], size: tuple[int, int], board: Board) -> Lens:
     """Estimates the lens of one camera, and the board's poses, from its views. ``size`` is width and height, px."""
     shots = [view.shot for view in views]
-    observed = observations(views, [views[0].camera], shots, board)
+    observed = observe_views(views, [views[0].camera], shots, board)
     state = _start(views, size, board)
     prior, sigma = weak_prior([size]), np.array([1.0])
     solution = adjust(state, observed, prior, sigma, loss=CAUCHY)

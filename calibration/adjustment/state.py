@@ -62,7 +62,7 @@ class BundleState:
         return RigidTransform(self.camera_rotations[index], self.camera_translations[index])
 
 
-def observations(views: Sequence[View], cameras: Sequence[str], shots: Sequence[str], board: Board) -> Observations:
+def observe_views(views: Sequence[View], cameras: Sequence[str], shots: Sequence[str], board: Board) -> Observations:
     """Collects the pixels of all views' corners and their positions on the board (mm)."""
     corners = board.corners()
     counts = [len(view.found.ids) for view in views]

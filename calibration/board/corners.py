@@ -41,7 +41,7 @@ def detect(grey: UInt8[np.ndarray, "h w"], board: Board) -> Found | None:
     corners = (_charuco if board.kind == "charuco" else _checkerboard)(picture, board)
     if corners is None or len(corners[0]) < CORNERS_LEAST or not is_flat_grid(board, *corners):
         return None
-    return Found(*corners, rise(picture, board, corners))
+    return Found(*corners, measure_rise(picture, board, corners))
 
 
 def is_flat_grid(board: Board, ids: Int[np.ndarray, " n"], corners: Float[np.ndarray, "n 2"]) -> bool:
@@ -56,7 +56,7 @@ def is_flat_grid(board: Board, ids: Int[np.ndarray, " n"], corners: Float[np.nda
     return bool(np.linalg.det(homography) > 0 and np.abs(back - flat).max() < BENT_MOST)
 
 
-def rise(grey: UInt8[np.ndarray, "h w"], board: Board, found: Corners) -> float:
+def measure_rise(grey: UInt8[np.ndarray, "h w"], board: Board, found: Corners) -> float:
     """Computes the width (px) of the board's edges, from 10 to 90 % of their contrast, in the blurrier of the board's
     two directions. Returns infinity if every edge is wider than the half square or the marker's border beside it."""
     ids, corners = found

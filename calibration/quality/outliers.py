@@ -114,7 +114,7 @@ def explain_shot(
         name: Camera(name, intrinsics_of(state.intrinsics[i], detections.sizes[name]), state.camera_pose(i))
         for i, name in enumerate(names)
     }
-    scale = board_scale(views, cameras, detections.board, boards[shot])
+    scale = estimate_board_scale(views, cameras, detections.board, boards[shot])
     if scale is not None:
         size, rms = scale
         if abs(size - 1) > 0.01 and rms < max(MATCH_RATIO * noise_px, VIEW_LEAST_PX):
@@ -151,7 +151,7 @@ def miss(view: View, camera: Camera, world_from_board: RigidTransform, board: Bo
     return min(values)
 
 
-def board_scale(
+def estimate_board_scale(
     views: Sequence[View], cameras: dict[str, Camera], board: Board, start: RigidTransform
 ) -> tuple[float, float] | None:
     """Estimates the board's size in a shot relative to its description, and the RMS error (px) at that size. Returns

@@ -23,7 +23,7 @@ from calibration.scene.matching import Matches, match_photographs
 from calibration.scene.photographs import find_masks, find_photographs
 from calibration.scene.result import SceneCalibration
 from calibration.scene.scale import Scale, find_scale
-from calibration.scene.structure import Structure, solve_structure, why_not
+from calibration.scene.structure import Structure, explain_missing_view, solve_structure
 from calibration.silhouette_refinement.refine import (
     FOLDS,
     GAIN_SIGMAS,
@@ -122,7 +122,7 @@ def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, di
     has too few cameras."""
     names = list(matches.sizes)
     joined = structure.rig.names if structure is not None else ()
-    left_out = {name: why_not(name, matches, joined) for name in names if name not in joined}
+    left_out = {name: explain_missing_view(name, matches, joined) for name in names if name not in joined}
     if structure is None or len(joined) < max(CAMERAS_LEAST, JOINED_LEAST * len(names)):
         few = compose("scene-views-join", joined=len(joined), all=len(names))
         reason = few if joined else compose("scene-no-view-joins", all=len(names))

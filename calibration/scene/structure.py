@@ -160,7 +160,7 @@ def _camera(name: str, image: Any, lens: Any) -> Camera:
     return Camera(name, intrinsics, RigidTransform(pose.rotation.matrix(), np.asarray(pose.translation)))
 
 
-def why_not(name: str, matches: Matches, joined: Collection[str]) -> Message:
+def explain_missing_view(name: str, matches: Matches, joined: Collection[str]) -> Message:
     """Explains why a view could not be joined to the others, and what to add."""
     features = matches.features[name]
     if features < FEATURES_LEAST:

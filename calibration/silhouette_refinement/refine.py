@@ -38,7 +38,7 @@ from calibration.silhouette_refinement.tangency_term import (
     tangency_residuals,
 )
 from pipeline.contour_fit.contour import solve_contour
-from pipeline.contour_fit.head_problem import head_problem
+from pipeline.contour_fit.head_problem import build_head_problem
 from pipeline.contour_fit.problem import PER_CAMERA, camera_information
 from pipeline.estimation.levenberg_marquardt import MIN_DAMPING, Limits, Solution, minimise
 from pipeline.estimation.robust import GemanMcClure
@@ -460,7 +460,7 @@ def rim_equations(
     problem = replace(solved.problem, camera_information=np.zeros_like(solved.problem.camera_information))
     stage = replace(solved.stage, cameras=True)
     scale_px = max(stage.scales_px[-1], solved.evidence.noise.floor_px)
-    whole = head_problem(problem, solved.evidence, stage, scale_px)
+    whole = build_head_problem(problem, solved.evidence, stage, scale_px)
     equations = whole.equations(whole.at(solved.state))
     matrix, gradient = equations.matrix, equations.gradient
     head_size = len(gradient) - PER_CAMERA * len(problem.views.names)

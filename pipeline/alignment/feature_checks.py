@@ -19,7 +19,7 @@ from pipeline.alignment.landmarks import MIN_POINTS, MIN_TRIANGLE_MM, flatness
 from pipeline.faces.landmark_map import LandmarkMap
 from pipeline.faces.matching import MatchedFaces
 from pipeline.geometry.projection import camera_depths, depth_map
-from pipeline.geometry.registration.nonrigid import landmark_warp
+from pipeline.geometry.registration.nonrigid import warp_by_landmarks
 from pipeline.geometry.registration.rigid import procrustes
 from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS
 from pipeline.head_model.model import HeadModel
@@ -139,7 +139,7 @@ def locate_landmarks(
     sources = places.points(mean)[firm]
     world_from_head = procrustes(sources + places.offset_mm[firm], face.points_world[firm])
     targets = world_from_head.inverse().apply(face.points_world[firm]) - places.offset_mm[firm]
-    bent = landmark_warp(sources, targets, mean[rows], smoothing=SMOOTHING_MM)
+    bent = warp_by_landmarks(sources, targets, mean[rows], smoothing=SMOOTHING_MM)
     return world_from_head.apply(bent), world_from_head
 
 

@@ -71,7 +71,7 @@ class FeatureAlignment:
     remarks: tuple[Message, ...]
 
 
-def feature_alignment(model: HeadModel, features: Features, rig: Rig) -> FeatureAlignment:
+def align_by_features(model: HeadModel, features: Features, rig: Rig) -> FeatureAlignment:
     """Aligns the mean head to picked feature points: rejects outliers, minimises the paper's eq. (3), then weights the
     points by their covariance. Raises TooFewFeatures or WrongFeatures."""
     if features.keys().isdisjoint(NAMES):

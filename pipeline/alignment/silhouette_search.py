@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.contour_fit.contour import run_stage
-from pipeline.contour_fit.head_problem import head_problem
+from pipeline.contour_fit.head_problem import build_head_problem
 from pipeline.contour_fit.problem import ContourProblem, Stage, State, first_evidence, make_problem, start_state
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
@@ -231,4 +231,4 @@ def _descended(
 ) -> tuple[float, State]:
     evidence = first_evidence(problem.settings)
     state, _, _ = run_stage(problem, evidence, state, stage, lambda fraction: None)
-    return head_problem(problem, evidence, stage, judged_px, REFERENCE_PX).at(state).cost, state
+    return build_head_problem(problem, evidence, stage, judged_px, REFERENCE_PX).at(state).cost, state

@@ -79,7 +79,7 @@ class FeatureTerm:
         return rows
 
 
-def head_problem(
+def build_head_problem(
     problem: ContourProblem, evidence: StageEvidence, stage: Stage, scale_px: float, reference_px: float | None = None
 ) -> Problem[State]:
     """Builds the least-squares problem of one stage as a list of terms that depend on shape, pose and perhaps cameras.
@@ -119,7 +119,7 @@ def started_problem(
     """Returns the least-squares problem, with its cost scaled to the outline length at ``start``, and its linearisation
     at ``start``."""
     seen = RimTerm(problem, evidence, stage, scale_px).at(start)
-    whole = head_problem(problem, evidence, stage, scale_px, float(seen.rim.length.sum()))
+    whole = build_head_problem(problem, evidence, stage, scale_px, float(seen.rim.length.sum()))
     rim, *others = whole.terms
     assert isinstance(rim, RimTerm)
     return whole, Sum((LinearisedRimTerm(rim, start, seen.rim), *(term.at(start) for term in others)))

@@ -41,7 +41,7 @@ class HairShell:
     covered: float  # share of the bust's hair within ``NEAR_MM`` of the shell; 1 without hair
 
 
-def hair_shell(head: Mesh, bust: Mesh, part: UInt8[np.ndarray, " b"]) -> HairShell:
+def move_to_hair(head: Mesh, bust: Mesh, part: UInt8[np.ndarray, " b"]) -> HairShell:
     """Moves a head outwards to the hair of a bust whose vertices have the labels ``part`` (codes of ``Part``)."""
     if not (part == Part.HAIR).any():
         return HairShell(head.vertices, np.zeros(len(head.vertices)), 1.0)

@@ -66,7 +66,7 @@ class OutlineSearch:
         return share
 
 
-def outline_search(model: HeadModel, views: Views, cameras: Sequence[Camera], hair: HairProbability) -> OutlineSearch:
+def pack_outlines(model: HeadModel, views: Views, cameras: Sequence[Camera], hair: HairProbability) -> OutlineSearch:
     """Prepares the comparison of a deformed head with the silhouettes' outlines.
 
     ``model``: the model whose full mesh is deformed. ``views``: the silhouettes. ``cameras``: cameras of the views,

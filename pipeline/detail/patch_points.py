@@ -68,7 +68,7 @@ class PatchSearch:
         return PatchMeasurements(self.patches.centre[kept], found.place[kept], information)
 
 
-def patch_search(
+def prepare_patch_search(
     model: HeadModel,
     fit: Fit,
     images: Mapping[str, UInt8[np.ndarray, "h w 3"]],

@@ -47,7 +47,7 @@ class CameraFigures:
     outside_rms_px: float | None = None
 
 
-def camera_figures(
+def measure_cameras(
     model: HeadModel, fit: Fit, silhouettes: Mapping[str, Silhouette], rig: Rig, fitted: Masks, started: Masks
 ) -> dict[str, CameraFigures]:
     """Computes the figures of every camera, in the order of the rig. The function uses the calibrated cameras without

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.array_cache import cached_arrays
-from pipeline.geometry.registration.nonrigid import landmark_warp
+from pipeline.geometry.registration.nonrigid import warp_by_landmarks
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel, load_model
 from rig.errors import EigenheadError
@@ -123,7 +123,7 @@ def _carried(model: HeadModel) -> Mapping[str, np.ndarray]:
         vertices = default.vertices(np.zeros(0))
         sources = vertices[[default.levels["full"].landmarks[name] for name in names]]
         points = landmark_map(default).points(vertices)
-        hits = SurfaceIndex(mean, faces).closest(landmark_warp(sources, targets, points))
+        hits = SurfaceIndex(mean, faces).closest(warp_by_landmarks(sources, targets, points))
         return {"rows": faces[hits.triangles], "weights": hits.weights}
 
     table = _table()
@@ -136,7 +136,7 @@ def _carried(model: HeadModel) -> Mapping[str, np.ndarray]:
         table["makehuman_rows"],
         table["makehuman_weights"],
     )
-    return cached_arrays("landmark-map", inputs, make, made_by=(SurfaceIndex, landmark_warp))
+    return cached_arrays("landmark-map", inputs, make, made_by=(SurfaceIndex, warp_by_landmarks))
 
 
 @cache

@@ -16,8 +16,8 @@ from pipeline.fusion.grid_kernels import component_of, compose_well
 from pipeline.fusion.hair import (
     STRAND_SHARE,
     Places,
+    correct_parts,
     extend_to_outlines,
-    parts_over_head,
     shell_deviation_mm,
     smooth_unresolved,
 )
@@ -163,7 +163,7 @@ def finish_bust(
     shares, shown = np.tile([1.0, 0.0, 0.0], (len(seen), 1)), np.full(len(seen), Part.SKIN, np.uint8)
     if votes is not None:
         shown = part_codes(votes, mesh.vertices)
-        shares = part_shares(votes if head is None else parts_over_head(votes, head.mesh_world), mesh.vertices)
+        shares = part_shares(votes if head is None else correct_parts(votes, head.mesh_world), mesh.vertices)
     skin, moved_mm = shares[:, Part.SKIN.channel], np.zeros(len(seen))
     strands, neck = surface.scatter * shares[:, Part.HAIR.channel], np.zeros(len(seen))
     clothes, noise_mm = shares[:, Part.CLOTHES.channel], seen_deviation_mm(measured)

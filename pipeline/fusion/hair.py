@@ -82,7 +82,7 @@ def find_silent_hair(
     Args:
         depth_maps: of the views.
         parts: the part maps by camera, in pixels of the photographs.
-        votes: part labels of the depth maps' points (``parts_over_head``); None means that no long hair is searched.
+        votes: part labels of the depth maps' points (``correct_parts``); None means that no long hair is searched.
         rig: the cameras as calibrated, world frame.
 
     Returns: The measured points (world frame, mm) of long hair, or None; the depth maps without this hair, or with less
@@ -225,7 +225,7 @@ def distance_to_hull(places: Float[np.ndarray, "n 3"], views: ViewStack) -> Floa
     return np.where(edges_mm > 0.0, -np.inf, outlines_mm).max(axis=0)
 
 
-def parts_over_head(votes: PartVotes, head_world: Mesh, stubble: bool = True) -> PartVotes:
+def correct_parts(votes: PartVotes, head_world: Mesh, stubble: bool = True) -> PartVotes:
     """Corrects part labels by their cells' heights over the head: skin far above the head becomes hair. With
     ``stubble``, hair close to the head becomes skin."""
     skin, hair = Part.SKIN.channel, Part.HAIR.channel

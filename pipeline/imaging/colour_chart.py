@@ -131,7 +131,7 @@ def empty_plates(plates: tuple[Plate, ...]) -> tuple[Plate, ...]:
     return tuple(plate for plate in plates if find_chart(plate) is None) or plates
 
 
-def charts_in(plates: tuple[Plate, ...]) -> list[Chart]:
+def find_charts(plates: tuple[Plate, ...]) -> list[Chart]:
     """Finds the colour charts in one camera's clean plates. If the plates are nearly equal, the first is searched."""
     searched = plates if len(plates) > 1 and _differ(plates) else plates[:1]
     return [chart for chart in map(find_chart, searched) if chart is not None]

@@ -10,7 +10,7 @@ LUMINANCE = np.array([0.35, 0.45, 0.2], np.float32)  # least noise for skin: its
 QUIET_LEVELS = 1.2  # noise below which matching needs no more blur
 
 
-def noise_level(grey: Float32[np.ndarray, "h w"]) -> float:
+def estimate_noise(grey: Float32[np.ndarray, "h w"]) -> float:
     """Estimates the standard deviation of an image's white noise (Immerkaer 1996,
     https://doi.org/10.1006/cviu.1996.0060), with a median because edges hardly affect it. The returned noise is at
     least 0.3 grey levels, the error of rounding to 8 bits."""

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.contour_fit.rim import Views
-from pipeline.imaging.grey import LUMINANCE, noise_level
+from pipeline.imaging.grey import LUMINANCE, estimate_noise
 
 MIN_BLUR_PX = 0.7  # below that a bilinear sample is mostly interpolation error
 INSIDE_PX, TEXTURE_BLUR_PX, TEXTURE_NOISES = 4.0, 2.0, 5.0
@@ -40,7 +40,7 @@ def load_photographs(images: Mapping[str, UInt8[np.ndarray, "h w 3"]], views: Vi
         width, height = views.size[k]
         image = images.get(views.names[k], np.zeros((height, width, 3), np.uint8))
         grey = image.astype(np.float32) @ LUMINANCE
-        noise = noise_level(grey)
+        noise = estimate_noise(grey)
         return grey, noise, shows_texture(grey, views.distance_map(k) < -INSIDE_PX, noise)
 
     grey, noise, speaks = zip(*map_in_threads(load, len(views.names)), strict=True)

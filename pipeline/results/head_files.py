@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8, UInt16
 from pipeline.head_model.subdivision import boundary_loops, close_loop
 from pipeline.results.reconstruction import QUALITY, Reconstruction, asset_extras, ply_comments
 from pipeline.texturing.chart_colours import CODES, ENCODED
-from pipeline.texturing.layout.normal_map import normal_mapped, vertex_tangents
+from pipeline.texturing.layout.normal_map import map_normals, vertex_tangents
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.pores.skin_maps import SkinMaps
 from pipeline.texturing.sets.specular import Specular
@@ -152,7 +152,7 @@ def _glb(result: Reconstruction, head: Mesh, normals: Float[np.ndarray, "v 3"]) 
     """Encodes head.glb, with morph targets if the settings request them."""
     skin, extras, blendshape_rig = head_skin(result, head), asset_extras(result), result.evidence.blendshape_rig
     if result.texturing.reduced is not None and skin is not None and result.texturing.atlas is not None:
-        mapped = normal_mapped(head.vertices, normals, result.texturing.atlas.layout, result.texturing.reduced)
+        mapped = map_normals(head.vertices, normals, result.texturing.atlas.layout, result.texturing.reduced)
         extras["rows_of_ply"] = mapped.rows.tolist()
         skin = replace(skin, uv=mapped.uv, source=mapped.rows, faces=mapped.mesh.faces)
         skin = replace(skin, normal_map=encode_image(".png", mapped.image), tangents=mapped.tangents)

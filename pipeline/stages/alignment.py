@@ -5,7 +5,7 @@ from typing import Literal
 
 from pipeline.alignment.face_alignment import align_to_face, frontmost_camera
 from pipeline.alignment.feature_checks import features_beside_face
-from pipeline.alignment.landmarks import TooFewFeatures, WrongFeatures, feature_alignment
+from pipeline.alignment.landmarks import TooFewFeatures, WrongFeatures, align_by_features
 from pipeline.alignment.silhouette_search import NoSubject, moved_to_hull, search_alignment, upright_axes
 from pipeline.contour_fit.problem import LandmarkObservations
 from pipeline.faces.landmark_map import landmark_map
@@ -100,7 +100,7 @@ def align_to_views(
         if not stated:
             front = frontmost_camera(pose.rotation[:, 2], pose.translation, rig)
         return Staged(Alignment(pose, front, "silhouettes", rival=found.rival))
-    found = feature_alignment(model, views.capture.features, rig)
+    found = align_by_features(model, views.capture.features, rig)
     names = [*views.capture.features, *rig.names]
     warnings = [compose("features", remark=remark) for remark in say_once(found.remarks, names)]
     return Staged(Alignment(found.world_from_head, front, "features"), warnings)

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.compute.threads import map_in_threads
-from pipeline.detail.hair_shell import MIN_COVERED, HairShell, hair_shell
+from pipeline.detail.hair_shell import MIN_COVERED, HairShell, move_to_hair
 from pipeline.fusion.fusion import BustSurface, DepthSurface, finish_bust, fuse
-from pipeline.fusion.hair import find_silent_hair, parts_over_head, remove_specks
+from pipeline.fusion.hair import correct_parts, find_silent_hair, remove_specks
 from pipeline.fusion.signed_distance import NoSurface
 from pipeline.fusion.skin import HeadSkin
 from pipeline.geometry.nearest import PointTree, nearest
@@ -84,7 +84,7 @@ def fuse_depth(
     settings = context.settings
     if settings.outputs.surface == "head":
         return Staged(None)
-    parts = None if depth.votes is None else parts_over_head(depth.votes, head_world, stubble=False)
+    parts = None if depth.votes is None else correct_parts(depth.votes, head_world, stubble=False)
     solid = map_in_threads(lambda k: remove_specks(depth.maps[k], labels.maps, context.rig), len(depth.maps))
     hair, maps, scatter = find_silent_hair(solid, labels.maps, parts, context.rig)
     try:
@@ -198,7 +198,7 @@ def push_out_hair(
     settings, rig = context.settings, context.rig
     if bust is None or settings.outputs.surface != "hair":
         return Staged(None)
-    shell = hair_shell(refined.mesh_world, bust.mesh_world, bust.surface.part)
+    shell = move_to_hair(refined.mesh_world, bust.mesh_world, bust.surface.part)
     mesh = Mesh(shell.vertices_world, refined.mesh_world.faces)
     normals, depths, layout = mesh.normals(), depth_maps(rig, mesh), find_layout(context.model, settings)[0]
     around = None if layout is None else layout.around

@@ -11,7 +11,7 @@ from pipeline.contour_fit.fit import Fit
 from pipeline.detail.blink import blinks_of, with_lids
 from pipeline.detail.expression_reading import read_expression
 from pipeline.detail.refine import DeformedSurface
-from pipeline.evidence.camera_metrics import CameraFigures, camera_figures, start_masks
+from pipeline.evidence.camera_metrics import CameraFigures, measure_cameras, start_masks
 from pipeline.evidence.expression import (
     MIN_SIGMA,
     READ_SIGMA,
@@ -74,7 +74,7 @@ def judge_head(
     fit, model, rig, outputs = head.fit, head.model, context.rig, context.settings.outputs
     before = start_masks(model, alignment.world_from_head, rig)
     fitted = {name: np.isfinite(depth) for name, depth in texturing.depths.items()}
-    cameras = camera_figures(model, fit, views.silhouettes, rig, fitted, before)
+    cameras = measure_cameras(model, fit, views.silhouettes, rig, fitted, before)
     widths_px = {camera.name: camera.intrinsics.width for camera in rig}
     made, min_sigma, closed_eyes, doubtful = fit, MIN_SIGMA, frozenset[str](), head.doubtful
     if refined.displaced is not None:

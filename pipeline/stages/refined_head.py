@@ -8,8 +8,8 @@ from jaxtyping import Float
 from pipeline.contour_fit.posterior import vertex_deviation_mm
 from pipeline.detail.depth_bias import remove_window_bias
 from pipeline.detail.eyelids import measure_eye_appearance
-from pipeline.detail.outline_points import outline_search
-from pipeline.detail.patch_points import patch_search
+from pipeline.detail.outline_points import pack_outlines
+from pipeline.detail.patch_points import prepare_patch_search
 from pipeline.detail.refine import MIN_OBSERVED_SHARE, DeformedSurface, refine_to_surface
 from pipeline.fusion.untangling import untangle_head
 from pipeline.photometric_fit.depth_search import head_depth_factor
@@ -54,7 +54,7 @@ def refine_head(
     factor = head_depth_factor(mesh, face, cameras)
     hair = labels.hiding_probability()
     points = remove_window_bias(depth.points, depth.on_face, depth.window_bias)
-    patches = patch_search(model, fit, depth.images, distances, hair, context.rig)
+    patches = prepare_patch_search(model, fit, depth.images, distances, hair, context.rig)
     displaced = refine_to_surface(
         fit,
         model,
@@ -63,7 +63,7 @@ def refine_head(
         deviation_mm=deviation_mm,
         eyes=measure_eye_appearance(model, mesh.vertices, views.capture.images, context.rig, faces.eye_openings),
         patches=patches,
-        outlines=outline_search(model, patches.views, patches.cameras, hair),
+        outlines=pack_outlines(model, patches.views, patches.cameras, hair),
         report=context.progress,
     )
     share, needed = float(displaced.observed[model.levels["full"].face_region].mean()), MIN_OBSERVED_SHARE

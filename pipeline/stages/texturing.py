@@ -17,10 +17,10 @@ from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
 from pipeline.texturing.albedo import DIM_SHARE, Albedo, estimate_albedo
 from pipeline.texturing.chart_colours import ChartColours, correct_capture, measure_charts
-from pipeline.texturing.layout.normal_map import ReducedLayout, reduced_layout
+from pipeline.texturing.layout.normal_map import ReducedLayout, reduce_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.paint import find_layout, paint_head
-from pipeline.texturing.pores.skin_maps import COARSER, CloseViews, SkinMaps, read_close_views, skin_maps, skin_share
+from pipeline.texturing.pores.skin_maps import COARSER, CloseViews, SkinMaps, map_skin, read_close_views, skin_share
 from pipeline.texturing.sets.texture_sets import SetTextures, colour_by_sets
 from pipeline.texturing.vertex_colours import Shown, Texture, colour_vertices
 from rig.capture import Capture
@@ -76,7 +76,7 @@ def texture_head(
     atlas = paint_head(layout, mesh, vertices, face, settings, None if close is None else close.views.scaled(COARSER))
     skin = None
     if close is not None and layout is not None and atlas is not None:
-        skin, atlas = skin_maps(
+        skin, atlas = map_skin(
             layout,
             atlas,
             mesh,
@@ -87,7 +87,7 @@ def texture_head(
             skin=skin_share(close.decision, mesh, labels.skin_probability()),
             world_from_head=head.fit.world_from_head,
         )
-    reduced = reduced_layout(model, layout.layout) if layout is not None and settings.outputs.normal_map else None
+    reduced = reduce_layout(model, layout.layout) if layout is not None and settings.outputs.normal_map else None
     albedo = None
     if settings.outputs.albedo != "none":
         albedo, of_albedo = estimate_albedo(mesh, normals, vertices, atlas, face, around, chart=chart)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from pipeline.geometry.projection import packed_lens
-from pipeline.imaging.grey import LUMINANCE, blur_growth, noise_left, noise_level
+from pipeline.imaging.grey import LUMINANCE, blur_growth, estimate_noise, noise_left
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.stereo.depth_map_kernels import fill_lens_map
 from rig.camera import Camera, Intrinsics
@@ -90,7 +90,7 @@ def _crop(
     )
     distance = np.where(distance > MAX_UNSEEN_PX, distance * scale, UNSEEN_PX).astype(np.float32)
     grey = colour.astype(np.float32) @ LUMINANCE
-    noise = noise_level(image.astype(np.float32) @ LUMINANCE)
+    noise = estimate_noise(image.astype(np.float32) @ LUMINANCE)
     blur = BLUR_PX * blur_growth(noise)
     levels = [Level(pinhole, _smooth(grey, blur), distance, noise_left(noise, blur))]
     for _ in range(1, LEVELS):

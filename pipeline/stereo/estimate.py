@@ -3,7 +3,7 @@
 Every view is matched with its neighbours, from coarse to fine, by windows on slanted planes that propagate between
 pixels (Bleyer, Rhemann and Rother, *PatchMatch stereo*, 2011, https://doi.org/10.5244/C.25.14). In contrast to
 PatchMatch, no random numbers are used. Silhouettes and the fitted head bound the search (``depth_range``). Semi-global
-matching of depths at even steps gives the first estimate (``first_fields``). Least squares then moves the windows by
+matching of depths at even steps gives the first estimate (``find_fields``). Least squares then moves the windows by
 fractions of a pixel and computes their information (Goesele et al., *Multi-view stereo for community photo
 collections*, 2007, https://doi.org/10.1109/ICCV.2007.4408933). Depths that no other view confirms are discarded.
 
@@ -85,7 +85,7 @@ APART_SHARE = 0.9  # of the mean square distance to the other views' surfaces, b
 PIXEL_SHARE = 0.56  # of a pixel's square on the surface, brought onto the ray, by the square of the views that agree
 
 
-def take_specks_off(
+def replace_specks(
     depth: Float32[np.ndarray, "h w"], slopes: Float32[np.ndarray, "h w 2"], pixel_mm: float, most_px: int
 ) -> Bool[np.ndarray, "h w"]:
     """Replaces, in place, small separate pieces of surface (at most ``most_px`` pixels) by a smooth surface through the
@@ -115,7 +115,7 @@ PLANE_ROUNDS = 2  # what takes a speck's place is tried against its neighbours, 
 MAX_SLIDE_PX = 1.0  # of a step: linear models of an image reach no farther
 
 
-def doubled(fields: Sequence[Field], stack: Stack) -> list[Field]:
+def upsample_fields(fields: Sequence[Field], stack: Stack) -> list[Field]:
     """Upsamples the fields to twice their width and height, the size of ``stack``. The fields keep a part of their
     information."""
 
@@ -142,7 +142,7 @@ class Pass:
     rounds: int  # of least squares
 
 
-def refined(fields: Sequence[Field], matching: Matching, once: Pass) -> list[Field]:
+def refine_fields(fields: Sequence[Field], matching: Matching, once: Pass) -> list[Field]:
     """Refines the field of every view: pixels take over their neighbours' planes, small wrong pieces of surface are
     replaced, and least squares then moves the planes."""
 
@@ -164,7 +164,7 @@ def _refined(field: Field, matching: Matching, view: int, once: Pass) -> Field:
             for parity, tried in ((0, ~black), (1, black)):
                 matcher.propagate(planes, parity, once.steps_px, SAME_PX * pixel_mm)
                 planes.fresh[tried] = False
-            specks = take_specks_off(depth, slopes, pixel_mm, once.speck_px)
+            specks = replace_specks(depth, slopes, pixel_mm, once.speck_px)
             planes.cost[specks], planes.fresh[specks] = -1.0, True
     before, known = depth, np.where(specks, np.float32(0.0), field.information) + MIN_INFORMATION
     information, relief, likeness = known, np.zeros_like(depth), np.zeros_like(depth)
@@ -179,7 +179,7 @@ def _refined(field: Field, matching: Matching, view: int, once: Pass) -> Field:
     return Field(depth, slopes, information.astype(np.float32), relief, likeness)
 
 
-def depth_maps(crops: Sequence[Crop], stack: Stack, fields: Sequence[Field]) -> tuple[DepthMap, ...]:
+def confirm_depths(crops: Sequence[Crop], stack: Stack, fields: Sequence[Field]) -> tuple[DepthMap, ...]:
     """Compares the full-size fields of all views with each other. Returns a depth map for each view, with only the
     pixels that other views confirm."""
     matched = np.concatenate([(1.0 / np.sqrt(field.information + 1e-6)).ravel() for field in fields])
@@ -318,14 +318,14 @@ def estimate_depth(
         level = first - doublings
         if doublings:
             stack = stack_crops(crops, level)
-            fields = doubled(fields, stack)
+            fields = upsample_fields(fields, stack)
         with matching_on(device, stack, neighbours, pattern, CONTRAST_LEVELS) as matching:
             if not doublings:
-                fields = first_fields(matching, depth_ranges)
+                fields = find_fields(matching, depth_ranges)
                 report("dense", 0.3)
-            fields = refined(fields, matching, PASSES[doublings])
+            fields = refine_fields(fields, matching, PASSES[doublings])
         report("dense", DONE[level])
-    found = depth_maps(crops, stack, fields)
+    found = confirm_depths(crops, stack, fields)
     report("dense", 1.0)
     return found
 
@@ -343,7 +343,7 @@ def find_search_level(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3
     return min(max(halvings, FIRST_LEVELS[0]), FIRST_LEVELS[-1])
 
 
-def first_fields(matching: Matching, depth_ranges: Sequence[DepthRange]) -> list[Field]:
+def find_fields(matching: Matching, depth_ranges: Sequence[DepthRange]) -> list[Field]:
     """Finds first depths in every view: matches depths at even steps through the range of each pixel, twice. The
     information of the returned fields is 0."""
 

@@ -137,7 +137,7 @@ class ShaderMatcher:
     def __init__(self, matching: Matching, view: int, device: ComputeDevice) -> None:
         stack, others = matching.stack, matching.neighbours[view]
         self._device, (pairs, distances, pattern) = device, matching.uploaded
-        self._shared = (pairs, distances, packed_ways(stack, view, others), pattern)
+        self._shared = (pairs, distances, pack_ways(stack, view, others), pattern)
         self._constants = {
             "SAMPLES": matching.pattern.shape[1],
             "VIEWS": max(1, *(len(each) for each in matching.neighbours)),
@@ -189,7 +189,7 @@ class ShaderMatcher:
         )  # fmt: skip
 
 
-def packed_ways(stack: Stack, view: int, others: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m 16"]:
+def pack_ways(stack: Stack, view: int, others: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m 16"]:
     """Packs the maps from a view's pixels to other views, one row for each, in the memory layout of the struct Way in
     shaders/matching.glsl. The last three numbers of a row are integers. The result has at least one row, since no GPU
     buffer may be empty."""

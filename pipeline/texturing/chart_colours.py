@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipeline.compute.threads import map_in_threads
-from pipeline.imaging.colour_chart import Chart, ChartCorrection, chart_correction, chart_normal, charts_in
+from pipeline.imaging.colour_chart import Chart, ChartCorrection, chart_correction, chart_normal, find_charts
 from pipeline.texturing.light import BAND_FACTORS, Light, harmonics
 from pipeline.texturing.visibility import LINEAR
 from pipeline.warnings import ReportWarning
@@ -47,11 +47,11 @@ class ChartColours:
 def measure_charts(capture: Capture, rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
     """Finds the charts in all clean plates, and computes the colour correction of each camera. Returns None and a
     warning if no plate shows a chart."""
-    charts = map_in_threads(lambda k: charts_in(capture.backgrounds.get(rig.names[k], ())), len(rig))
-    return colours_of_charts(dict(zip(rig.names, charts, strict=True)), rig)
+    charts = map_in_threads(lambda k: find_charts(capture.backgrounds.get(rig.names[k], ())), len(rig))
+    return combine_charts(dict(zip(rig.names, charts, strict=True)), rig)
 
 
-def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
+def combine_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
     """Computes the colour correction of each camera from its charts. Returns None and a warning without a chart."""
     found = {name: chart_correction(visible) for name, visible in charts.items() if visible}
     cameras = {name: correction for name, correction in found.items() if correction is not None}

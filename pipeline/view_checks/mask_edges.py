@@ -60,7 +60,7 @@ class Edge:
         return clear and abs(self.offset_px) >= MIN_OFF * self.size_px
 
 
-def edge_beside(image: ImageRgb, silhouette: Silhouette) -> Edge | None:
+def find_edge(image: ImageRgb, silhouette: Silhouette) -> Edge | None:
     """Finds the strongest edge of the photograph parallel to an outline; None if too little of the outline is inside
     the picture."""
     size = float(np.sqrt(np.count_nonzero(silhouette.mask)))
@@ -103,7 +103,7 @@ def masks_off_edges(
     ``images``: RGB, by camera. ``silhouettes``: by camera. ``ready``: cameras whose mask was supplied.
     """
     judged = [name for name in ready if name in images and name in silhouettes and silhouettes[name].quality.usable]
-    edges = [edge for name in judged if (edge := edge_beside(images[name], silhouettes[name])) is not None]
+    edges = [edge for name in judged if (edge := find_edge(images[name], silhouettes[name])) is not None]
     off = [edge.offset_px for edge in edges if edge.is_off]
     middle = float(np.median(off)) if off else 0.0
     alike = [offset for offset in off if offset * middle > 0]
@@ -123,8 +123,8 @@ def masks_alone_exchanged(
         silhouettes: of the masks, as they are filed.
         pictures: for each camera with a wrong mask, the name under which its own mask is filed.
     """
-    filed = [edge_beside(images[name], silhouettes[name]) for name in pictures]
-    moved = [edge_beside(images[name], silhouettes[owner]) for name, owner in pictures.items()]
+    filed = [find_edge(images[name], silhouettes[name]) for name in pictures]
+    moved = [find_edge(images[name], silhouettes[owner]) for name, owner in pictures.items()]
     heights = [[edge.height for edge in edges if edge is not None] for edges in (filed, moved)]
     if not heights[0] or not heights[1]:
         return False
@@ -156,7 +156,7 @@ def find_turned_masks(
 
 
 def _height_at_outline(image: ImageRgb, silhouette: Silhouette) -> float:
-    edge = edge_beside(image, silhouette)
+    edge = find_edge(image, silhouette)
     return 0.0 if edge is None else edge.height_at_outline
 
 

@@ -105,7 +105,7 @@ def capture_with(session: RigSession, out: Path) -> Shot:
     return shot
 
 
-def board_shots(
+def take_board_shots(
     config: RigConfig, out: Path, count: int, make_driver: MakeDriver = driver_for, *, pause_s: float = 4.0
 ) -> Iterator[tuple[str, tuple[str, ...], tuple[Fault, ...]]]:
     """Takes ``count`` shots of a calibration board and writes ``out/<camera>/<shot>.png`` for `eigenhead calibrate`.
@@ -120,13 +120,13 @@ def board_shots(
         session.warm_up()
         for name in itertools.islice(names, count):
             time.sleep(pause_s)
-            shot = board_shot(session)
+            shot = take_board_shot(session)
             for camera, image in shot.images.items():
                 write_image(out / camera / f"{name}.png", image)
             yield name, tuple(shot.images), shot.faults
 
 
-def board_shot(session: RigSession) -> Shot:
+def take_board_shot(session: RigSession) -> Shot:
     """Takes one shot of a calibration board with an open session. The rig needs neither calibration nor clean plates.
 
     Returns the pictures that cameras delivered, and the faults. Leaves out the faults that the calibration board causes

@@ -15,7 +15,7 @@ from rig.progress import Progress
 from server.address import listen
 from server.cli.client import Client, Unreachable
 from server.processes import python_command, python_environment
-from server.services.truth import error_mm
+from server.services.truth import measure_error_mm
 from server.settings import ServiceSettings
 from server.tasks.prepare import prepare_kernels
 
@@ -45,7 +45,7 @@ def run_demo(out: Path, *, seed: int, full: bool, report: Progress) -> dict[str,
             job = client.submit(capture["id"], settings=requested)
             client.wait(job["id"], report=lambda stage, share: report(stage, 0.1 + 0.9 * share))
             client.download(job["id"], out)
-        error = error_mm(data / "captures" / capture["id"] / "truth", out / "head.ply")
+        error = measure_error_mm(data / "captures" / capture["id"] / "truth", out / "head.ply")
     document = json.loads((out / "report.json").read_text())
     return {
         "ply": str(out / "head.ply"),

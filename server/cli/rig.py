@@ -88,11 +88,11 @@ def rig_board(
     json_out: Json = False,
 ) -> None:
     """Take shots of the calibration board with every camera."""
-    from rig.acquisition.commands import board_shots
+    from rig.acquisition.commands import take_board_shots
     from rig.formats.rig_toml import read_rig_config
 
     document = []
-    for name, cameras, faults in board_shots(read_rig_config(rig), out, shots, pause_s=pause_s):
+    for name, cameras, faults in take_board_shots(read_rig_config(rig), out, shots, pause_s=pause_s):
         texts = [str(fault) for fault in faults]
         print(f"{name}  {len(cameras)} pictures  {'; '.join(texts)}".rstrip(), file=sys.stderr)
         document.append({"shot": name, "cameras": list(cameras), "faults": texts})

@@ -14,7 +14,7 @@ from rig.messages.message import Message, compose
 from rig.progress import Progress
 from server.console.live_frame import measured_frame
 from server.services.live.live import document_of
-from server.services.rigs import PREVIEW_WIDTH, RigBackend, jpeg, reduced
+from server.services.rigs import PREVIEW_WIDTH, RigBackend, encode_jpeg, reduced
 from server.services.service import Service
 from server.storage.records import JsonObject
 from server.tasks.child import Child, WorkerContext
@@ -33,7 +33,7 @@ def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> JsonObject:
     if picture is None:
         return {"name": name, "jpeg": None, "fault": compose("camera-shows-nothing").document()}
     small = reduced(picture, PREVIEW_WIDTH)  # a tile is 320 points wide, twice as many pixels on a dense screen
-    return measured_frame(name, small, jpeg(small), picture if sharp else None)
+    return measured_frame(name, small, encode_jpeg(small), picture if sharp else None)
 
 
 def rig_frames(rig: RigBackend, child: Child, look: int) -> list[JsonObject]:

@@ -47,7 +47,7 @@ from server.console.page import as_problem
 from server.errors import NotFound, Unavailable
 from server.services.keys import Caller
 from server.services.service import Service
-from server.services.truth import surface_distance
+from server.services.truth import measure_distance
 from server.services.work import refuse_board
 from server.storage.face_cache import faces_once
 from server.storage.records import CaptureRecord, JsonObject
@@ -441,7 +441,7 @@ def to_surface(result: Path, other: Path, *, align: bool = False) -> Float[np.nd
     """
     mine, theirs = read_mesh(result / "head.ply"), read_mesh(other)
     points = moved_onto(mine, theirs) if align else mine.vertices
-    return surface_distance(points, theirs)
+    return measure_distance(points, theirs)
 
 
 def moved_onto(mine: Mesh, theirs: Mesh) -> Float[np.ndarray, "v 3"]:

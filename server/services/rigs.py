@@ -15,7 +15,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from rig.acquisition.commands import board_shot
+from rig.acquisition.commands import take_board_shot
 from rig.acquisition.judgement import PlatesRefused
 from rig.acquisition.plates import PlatesVersion, link_plates, plates_versions
 from rig.acquisition.session import RigSession
@@ -102,7 +102,7 @@ class RealRig:
     def _board_shot(self, folder: Path) -> ShotDocument:
         with self._lock:
             try:
-                shot = board_shot(self._opened())
+                shot = take_board_shot(self._opened())
             except ShotFailed as error:
                 faults = [fault.message() for fault in error.faults]
                 raise Unavailable("shot-failed", compose("no-board-picture", faults=faults), faults) from error
@@ -123,7 +123,7 @@ class RealRig:
             image = self._opened().look([camera]).get(camera)
         if image is None:
             raise Unavailable("camera-missing", compose("camera-without-picture", camera=camera), [camera])
-        return jpeg(image)
+        return encode_jpeg(image)
 
     def camera_settings(self, camera: str) -> CameraSettingsOut:
         """Returns the settings requested of a camera, by rig.toml or by the operator, and those that the driver did not
@@ -282,7 +282,7 @@ class SimulatedRig:
         """Renders what one camera sees, as a JPEG file. Raises NotFound for an unknown camera."""
         check_camera(camera, self._rig().names)
         with self._one_at_a_time:
-            return jpeg(self._child.remote(look)(cameras=[camera])[camera])
+            return encode_jpeg(self._child.remote(look)(cameras=[camera])[camera])
 
     def camera_settings(self, camera: str) -> CameraSettingsOut:
         """Returns settings without values, since simulated cameras have none. Raises NotFound for an unknown camera."""
@@ -362,7 +362,7 @@ def rig_state(
     return RigOut(id=identity, kind=kind, ready=ready, cameras=cameras, faults=tuple(faults), calibration=calibration)
 
 
-def jpeg(image: ImageRgb) -> bytes:
+def encode_jpeg(image: ImageRgb) -> bytes:
     """Encodes an RGB image as a JPEG file. An image wider than ``PREVIEW_WIDTH`` pixels is reduced to that width."""
     return encode_image(".jpg", reduced(image, PREVIEW_WIDTH), (cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY))
 

@@ -12,7 +12,7 @@ import pytest
 from pipeline.settings import Settings
 from rig.formats.captures.archive import pack_folder
 from server.cli.client import Client
-from server.services.truth import error_mm
+from server.services.truth import measure_error_mm
 from server.tasks.stage_durations import StageDurations
 from tests.support.services import ROOT, running_service
 from tests.support.shared_data import shared
@@ -59,7 +59,7 @@ def test_a_foreign_capture_through_the_service_and_the_command_line_gives_the_sa
             client.download(job["id"], tmp_path / "service")
     learnt.append(durations())
     assert {"segmentation", "fit", "texture"} <= set(stages)
-    assert error_mm(truth, tmp_path / "service" / "head.ply")["median"] < HULL_MEDIAN_MM
+    assert measure_error_mm(truth, tmp_path / "service" / "head.ply")["median"] < HULL_MEDIAN_MM
     words = ["-m", "server.cli", "reconstruct", str(folder), "--out", str(tmp_path / "local"), "--json"]
     done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 0, done.stderr

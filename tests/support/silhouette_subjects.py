@@ -17,7 +17,7 @@ from rig.rig import Rig
 from rig.studio.scene.anatomy import anatomy
 from rig.studio.scene.hair import grow
 from rig.studio.scene.subject import random_look, random_pose
-from rig.studio.scene.worn import shirt
+from rig.studio.scene.worn import make_shirt
 
 SPREAD_DEG, SPREAD_MM = 4.0, 12.0  # how subjects sit
 MODES = 60
@@ -49,7 +49,7 @@ def dressed_head(
     if style:
         hair = grow(vertices, body, style, rng)
         pieces.append((hair.shell, hair.shell_faces))
-    worn = shirt(Mesh(vertices, faces), body, rng)
+    worn = make_shirt(Mesh(vertices, faces), body, rng)
     if worn:
         pieces.append(worn)
     starts = np.cumsum([0] + [len(points) for points, _ in pieces])

@@ -23,7 +23,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.anatomy import anatomy
 from rig.studio.scene.hair import HairStyle, grow
-from rig.studio.scene.worn import shirt
+from rig.studio.scene.worn import make_shirt
 
 SPREAD = 0.8  # section 5.2: Gaussian within +-0.8 standard deviations
 TURN, SHIFT_MM = 0.06, 8.0  # a seated subject: standard deviation of its pose
@@ -127,7 +127,7 @@ def worn_silhouettes(
     ``strands`` they are like masks that count a pixel from one half of coverage on: most strands are thinner."""
     head, full = model.vertices(subject.coefficients), model.levels["full"]
     body = anatomy(head, {name: head[row] for name, row in model.landmarks.items()})
-    hair, worn = grow(head, body, style, rng), shirt(Mesh(head, full.faces), body, rng)
+    hair, worn = grow(head, body, style, rng), make_shirt(Mesh(head, full.faces), body, rng)
     pieces = [(head, full.faces), (hair.shell, hair.shell_faces)]
     pieces += [(hair.strands, hair.strand_faces)] if strands else []
     pieces += [worn] if worn is not None else []

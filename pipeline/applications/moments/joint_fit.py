@@ -127,7 +127,7 @@ class LinearisedJointTerm:
         equations.gradient[shared] -= self.repeated * self.values
 
 
-def joint_problem(solutions: Sequence[ContourSolution], common: float = COMMON) -> tuple[Problem[States], Layout]:
+def build_joint_problem(solutions: Sequence[ContourSolution], common: float = COMMON) -> tuple[Problem[States], Layout]:
     """Builds the least-squares problem of all captures, from the last stage of each capture's solution."""
     problems = tuple(last_problem(each)[0] for each in solutions)
     layout = lay_out(solutions, problems)
@@ -179,7 +179,7 @@ def fit_jointly(
         eigenheads: the number of eigenheads, which are the first modes.
         watch: called before every step; an exception that it raises ends the fit.
     """
-    problem, layout = joint_problem(solutions)
+    problem, layout = build_joint_problem(solutions)
     limits, arrow = Limits(STEPS, TOLERANCE, TRIES, NON_MONOTONE), layout.arrow
     found = minimise(problem, start_at_mean(solutions), limits, solve=arrow.solve, least=arrow.least, watch=watch)
     states = found.value
@@ -240,7 +240,7 @@ def joint_covariances(solutions: Sequence[ContourSolution]) -> Iterator[Float[np
     """Yields the covariance of each capture's coefficients, rotation, translation and log scale after the joint fit.
     The independent part of the errors follows from the joint normal matrix; the common part, the fraction ``COMMON``,
     keeps the covariance of the capture's separate fit. Weights at bounds get the variance that ``finish`` defines."""
-    problem, layout = joint_problem(solutions, common=0.0)
+    problem, layout = build_joint_problem(solutions, common=0.0)
     here = problem.at(tuple(each.state for each in solutions))
     assert isinstance(here, Sum)
     (joint,) = here.parts

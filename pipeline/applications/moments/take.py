@@ -98,7 +98,7 @@ def reconstruct_take(
     moments = []
     for solved, (name, covariance) in zip(joint, zip(contexts, joint_covariances(joint), strict=True), strict=True):
         steps, head = fitted.pop(name)
-        apart = differ_by(head.fit, solved, eigenheads)
+        apart = measure_difference(head.fit, solved, eigenheads)
         with name_errors(name):
             result = steps.send(joined(head, solved, covariance, eigenheads))
         moments.append(_moment(name, result, apart))
@@ -129,7 +129,7 @@ def joined(head: HeadFit, solved: ContourSolution, covariance: Float[np.ndarray,
     return replace(head, fit=fit, solution=None)
 
 
-def differ_by(alone: Fit, joint: ContourSolution, eigenheads: int) -> float:
+def measure_difference(alone: Fit, joint: ContourSolution, eigenheads: int) -> float:
     """Returns the difference between a capture's separately estimated identity and the joint identity: the RMS over the
     eigenheads, in standard deviations of the capture's separate posterior."""
     assert alone.covariance is not None

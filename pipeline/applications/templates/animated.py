@@ -27,7 +27,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.sparse.linalg import splu
 
 from pipeline.applications.templates.carrying import Attachment, SurfaceBinding, bind_vertices, frames
-from pipeline.applications.templates.contact import RestSurface, keep_apart, rest_surface
+from pipeline.applications.templates.contact import RestSurface, keep_apart, prepare_rest_surface
 from pipeline.applications.templates.eyeballs import STRAIGHT, Eyeball, lift_lids, place_eyeballs
 from pipeline.applications.templates.inner_mouth import InnerMouth, keep_off_teeth, place_inner_mouth
 from pipeline.applications.templates.pivots import EYE_REACH_MM, Points, in_mouth, jaw_motions, pivots
@@ -270,7 +270,7 @@ def animate_mesh(
         for rows in balls
         if name.startswith("eye_") and np.linalg.norm(mesh[rows].mean(axis=0) - pivot) < 0.5 * EYE_REACH_MM
     }
-    parted = parted_shapes(rest_surface(mesh, triangles), carried)
+    parted = parted_shapes(prepare_rest_surface(mesh, triangles), carried)
     loose = np.where(surface_binding.wholes >= 0, -1, loose_parts(surface_binding, triangles, len(mesh)))
     jaw = jaw_motions(landmarks, vertices, shapes)
     bare = AnimatedMesh(mesh, parted, found, eyes, gazes=gazes)

@@ -2,7 +2,7 @@
 
 A skin vertex of the template stores its triangle of the head model, its barycentric coordinates in that triangle, and
 its offset in the triangle's frame. Vertices below the skin (mouth, sockets, lashes) follow the surrounding skin by the
-smooth map in ``landmark_warp``. Closed parts (eyeballs, teeth) get a similarity transform, so that a ball stays a ball.
+smooth map in ``warp_by_landmarks``. Closed parts (eyeballs, teeth) get a similarity, so that a ball stays a ball.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from pipeline.geometry.registration.nonrigid import landmark_warp
+from pipeline.geometry.registration.nonrigid import warp_by_landmarks
 from pipeline.geometry.registration.rigid import procrustes
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.gaussian_process import spread_nodes
@@ -85,7 +85,7 @@ class SurfaceBinding:
         deep = self.wholes < 0
         deep[self.skin] = False
         if deep.any():
-            out[deep] = landmark_warp(self.rest[self.anchors], out[self.anchors], self.rest[deep])
+            out[deep] = warp_by_landmarks(self.rest[self.anchors], out[self.anchors], self.rest[deep])
         for number, anchors in enumerate(self.whole_anchors):
             part = self.wholes == number
             out[part] = procrustes(self.rest[anchors], out[anchors]).apply(self.rest[part])

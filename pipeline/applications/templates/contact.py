@@ -46,7 +46,7 @@ class RestSurface:
     excluded: Bool[np.ndarray, " f"]
 
 
-def rest_surface(vertices: Vertices, faces: Int[np.ndarray, "f 3"]) -> RestSurface:
+def prepare_rest_surface(vertices: Vertices, faces: Int[np.ndarray, "f 3"]) -> RestSurface:
     """Prepares a mesh without expression (mm) for the collision tests."""
     count = len(vertices)
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from pipeline.applications.templates.carrying import Attachment, SurfaceBinding, bind_vertices, surface_binding
 from pipeline.applications.templates.likeness import CANDIDATES, Likeness, SurfaceMarks, fit_model_to_mesh
 from pipeline.applications.templates.placement import Surface, find_place, outward, place_by_landmarks
-from pipeline.geometry.registration.nonrigid import Search, Target, draw_to_target, landmark_warp
+from pipeline.geometry.registration.nonrigid import Search, Target, draw_to_target, warp_by_landmarks
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.gaussian_process import spread_nodes
 from pipeline.head_model.model import HeadModel
@@ -252,5 +252,5 @@ def _followed(before: Vertices, after: Vertices, skin: Flags) -> Vertices:
     rows = np.flatnonzero(skin)
     rows = rows[spread_nodes(before[rows], min(400, len(rows)))]
     out = after.copy()
-    out[~skin] = landmark_warp(before[rows], after[rows], before[~skin])
+    out[~skin] = warp_by_landmarks(before[rows], after[rows], before[~skin])
     return out

@@ -57,7 +57,7 @@ class BestFit:
     scale: float
 
 
-def best_fit(measured: Measured, reference: Reference) -> BestFit:
+def align_face(measured: Measured, reference: Reference) -> BestFit:
     """Finds the rigid motion that aligns the face of a measured head to the reference. Raises InputError if the
     reference is not a scan of this head."""
     face = measured.regions["face"]

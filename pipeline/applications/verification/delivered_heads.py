@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.applications.model_building.training.build import FEWEST, Built, cages_through
+from pipeline.applications.model_building.training.build import FEWEST, Built, compute_cages
 from pipeline.applications.model_building.training.training import USED_MODES, above_neck, centred
 from pipeline.applications.verification.measured import DOUBTFUL, Measured, identity_of, is_result, read_measured
 from pipeline.head_model.model import HeadModel, assemble
@@ -207,7 +207,7 @@ def read_delivered(
     if faults:
         raise InputError(str(folder), faults)
     empty = np.zeros((0, *model.mean.shape))
-    cages = cages_through(np.array(points), model) if points else empty
+    cages = compute_cages(np.array(points), model) if points else empty
     return Delivered(tuple(names), cages, np.array(deviations) if points else empty[:, :, 0]), skipped
 
 

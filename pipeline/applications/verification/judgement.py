@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import rankdata
 
-from pipeline.applications.verification.best_fit import BestFit, best_fit, counted
+from pipeline.applications.verification.best_fit import BestFit, align_face, counted
 from pipeline.applications.verification.measured import Measured
 from pipeline.applications.verification.reference import Reference
 from pipeline.evidence.measurements import DISTANCES
@@ -200,7 +200,7 @@ def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) ->
 def judge_one(measured: Measured, reference: Reference) -> Judged:
     """Judges one head against the reference scan. Raises InputError if the reference shows another head, or if its
     faces point inwards."""
-    fit = best_fit(measured, reference)
+    fit = align_face(measured, reference)
     there = fit.reference_from_world.apply(measured.mesh_world.vertices)
     hits = reference.index.closest(there)
     side = np.einsum("nc,nc->n", there - hits.points, hits.normals)

@@ -21,7 +21,7 @@ from pipeline.applications.wrapping.wrap import Wrapped, residual_colours
 from pipeline.results.overlays import clay, contact_sheet
 from rig.files import write_atomically
 from rig.formats.meshes.ply import ply_bytes
-from rig.formats.meshes.polygon_obj import fan, polygon_obj_bytes
+from rig.formats.meshes.polygon_obj import polygon_obj_bytes, triangulate_fan
 from rig.formats.pictures.images import write_image
 from rig.image import ImageRgb
 from rig.mesh import Mesh, vertex_normals
@@ -143,7 +143,7 @@ def baked_textures(wrapped: Wrapped) -> dict[Tile, UInt8[np.ndarray, "s s 3"]]:
     mesh, scan = wrapped.template.mesh, wrapped.placed.scan
     tiles = corner_tiles(mesh)
     of_polygon = np.repeat(np.arange(len(mesh.sizes)), mesh.sizes - 2)
-    rows = fan(mesh.sizes)
+    rows = triangulate_fan(mesh.sizes)
     covered = wrapped.covered[mesh.corners[rows]].any(axis=1)
     found = np.unique(tiles[of_polygon[covered]], axis=0)
     found = found[(found >= 0).all(axis=1)]

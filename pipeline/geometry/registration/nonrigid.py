@@ -120,7 +120,7 @@ def _bending(faces: Int[np.ndarray, "F 3"], vertices: Float[np.ndarray, "V 3"]) 
     return sparse.csr_array(laplacian.T @ laplacian)
 
 
-def landmark_warp(
+def warp_by_landmarks(
     source: Float[np.ndarray, "L 3"],
     target: Float[np.ndarray, "L 3"],
     points: Float[np.ndarray, "N 3"],

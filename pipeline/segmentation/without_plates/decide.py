@@ -26,8 +26,8 @@ from pipeline.segmentation.without_plates.mask_search import CoarseMask, head_co
 from pipeline.segmentation.without_plates.viewing_volume import (
     ViewingVolume,
     ask_other_views,
+    build_volume,
     viewing_ball,
-    viewing_volume,
 )
 from rig.rig import Rig
 
@@ -76,7 +76,7 @@ def decide_without_plates(
         plane = None  # a patterned shirt is as flat as a table, but upright
     if plane is not None:
         ball = ball_above(plane, points.points, *ball)
-    volume = viewing_volume(rig, sizes, ball, plane_world=plane)
+    volume = build_volume(rig, sizes, ball, plane_world=plane)
     background = {
         camera.name: background_seen(points, camera.name, camera.intrinsics.width, sizes[camera.name], volume, plane)
         for camera in rig

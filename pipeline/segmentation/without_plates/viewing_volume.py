@@ -61,7 +61,7 @@ def viewing_ball(
     return centre, radius
 
 
-def viewing_volume(
+def build_volume(
     rig: Rig,
     sizes: Mapping[str, tuple[int, int]],
     ball: tuple[Float[np.ndarray, " 3"], float],

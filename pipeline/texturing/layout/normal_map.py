@@ -42,7 +42,7 @@ class ReducedLayout:
     faces: Faces
 
 
-def reduced_layout(model: HeadModel, layout: Layout) -> ReducedLayout:
+def reduce_layout(model: HeadModel, layout: Layout) -> ReducedLayout:
     """Computes the reduced UV layout of a head model's full mesh from its mean head, and caches the result."""
     mean, region = model.vertices(np.zeros(0)), model.levels["full"].face_region
 
@@ -89,7 +89,7 @@ class NormalMapped:
     image: UInt8[np.ndarray, "s s 3"]
 
 
-def normal_mapped(
+def map_normals(
     vertices: Vertices, normals: Vertices, layout: Layout, reduced: ReducedLayout, size: int = SIZE_PX
 ) -> NormalMapped:
     """Reduces a head's mesh (mm, unit normals) to fewer triangles; computes a normal map of the lost detail."""

@@ -60,7 +60,7 @@ class TexelFrames:
         return cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
-def texel_frames(
+def compute_frames(
     layout: Layout,
     mesh_world: Mesh,
     normals: Float[np.ndarray, "v 3"],

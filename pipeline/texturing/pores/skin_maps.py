@@ -17,7 +17,7 @@ from pipeline.texturing.chart_colours import CODES, ENCODED, ChartColours, corre
 from pipeline.texturing.layout.uv_unwrap import Atlas, ModelLayout
 from pipeline.texturing.light import fit_light, transfer
 from pipeline.texturing.paint_kernels import Choice, Pictures
-from pipeline.texturing.pores.relief import MIN_SKIN, HalfPictures, Strips, TexelFrames, estimate_detail, texel_frames
+from pipeline.texturing.pores.relief import MIN_SKIN, HalfPictures, Strips, TexelFrames, compute_frames, estimate_detail
 from pipeline.texturing.vertex_colours import Texture
 from pipeline.texturing.visibility import LINEAR, Decision, pack_pictures
 from rig.camera import Camera
@@ -124,7 +124,7 @@ def mean_of(
     return np.ascontiguousarray(views.T, np.int32), np.ascontiguousarray(shares.T, np.float32)
 
 
-def halves_of(close: CloseViews, world_from_head: Similarity) -> HalfPictures:
+def halve(close: CloseViews, world_from_head: Similarity) -> HalfPictures:
     """Divides the views into two disjoint sets, alternating in their order around the head."""
     towards = np.array([camera.centre_world for camera in close.views]) - world_from_head.translation
     in_head = towards @ world_from_head.rotation
@@ -167,7 +167,7 @@ class SkinMaps:
 
 
 @traced
-def skin_maps(
+def map_skin(
     layout: ModelLayout,
     atlas: Atlas,
     mesh_world: Mesh,
@@ -189,9 +189,9 @@ def skin_maps(
     white = transfer(mesh_world, normals, layout.around)
     light = fit_light(white, linear_from_srgb(coloured.colours / 255.0), (coloured.views > 0) & face)
     grey = np.zeros(9) if light is None else light.coefficients.mean(axis=1)
-    frames = texel_frames(layout.layout, mesh_world, normals, grey, white @ grey, skin)
+    frames = compute_frames(layout.layout, mesh_world, normals, grey, white @ grey, skin)
     size = len(atlas.image)
-    found = estimate_detail(Strips.of(layout.layout, size, skin >= MIN_SKIN), halves_of(close, world_from_head), frames)
+    found = estimate_detail(Strips.of(layout.layout, size, skin >= MIN_SKIN), halve(close, world_from_head), frames)
     displacement: UInt16[np.ndarray, "s s"] = np.empty((size, size), np.uint16)
     drawn: UInt8[np.ndarray, "s s 3"] = np.empty((size, size, 3), np.uint8)
 

@@ -61,7 +61,7 @@ class Specular:
         return np.rint(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
 
 
-def exposure_ratios(
+def measure_exposures(
     cross: Mapping[str, ImageRgb],
     parallel: Mapping[str, ImageRgb],
     silhouettes: Mapping[str, Silhouette],
@@ -114,7 +114,7 @@ def specular_light(
     vertices. ``silhouettes``: by camera. ``layout``: UV layout of the head. ``size``: width of the map in texels.
     """
     views = decision.views
-    exposure = exposure_ratios(cross, parallel, silhouettes, views.names)
+    exposure = measure_exposures(cross, parallel, silhouettes, views.names)
 
     def mirrored(k: int) -> Float32[np.ndarray, "_ _ 3"]:
         name = views.names[k]

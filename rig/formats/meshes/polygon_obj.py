@@ -39,10 +39,10 @@ class PolygonMesh:
 
     def triangles(self) -> Int[np.ndarray, "f 3"]:
         """Triangulates every polygon as a fan of triangles at its first corner."""
-        return self.corners[fan(self.sizes)]
+        return self.corners[triangulate_fan(self.sizes)]
 
 
-def fan(sizes: Int[np.ndarray, " p"]) -> Int[np.ndarray, "f 3"]:
+def triangulate_fan(sizes: Int[np.ndarray, " p"]) -> Int[np.ndarray, "f 3"]:
     """Triangulates polygons with ``sizes`` corners each. Returns the rows of ``corners`` that form each triangle."""
     first = np.cumsum(sizes) - sizes
     count = sizes - 2

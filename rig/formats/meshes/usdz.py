@@ -47,7 +47,7 @@ def scene_usdz_bytes(scene: Scene) -> bytes:
     with tempfile.TemporaryDirectory() as scratch:
         layer = Path(scratch) / "head.usdc"
         write_layer(layer, scene)
-        return package({"head.usdc": layer.read_bytes()} | images)
+        return pack_usdz({"head.usdc": layer.read_bytes()} | images)
 
 
 def openusd_module(name: str) -> Any:
@@ -124,7 +124,7 @@ def _write_skin(stage: Any, shape: Any, part: Part, skin: Skin) -> None:
     UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)
 
 
-def package(files: dict[str, bytes]) -> bytes:
+def pack_usdz(files: dict[str, bytes]) -> bytes:
     """Packs files into a zip without compression or times. As USDZ requires, each file begins at a multiple of 64
     bytes, and the USD layer is first."""
     data = BytesIO()

@@ -260,7 +260,7 @@ def _lips(vertices: Float[np.ndarray, "v 3"], marks: Landmarks) -> Float[np.ndar
     return smoothstep(1.35, 0.9, np.hypot(across, down))
 
 
-def hang(shell: Hair, below: Points, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
+def make_hanging_hair(shell: Hair, below: Points, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
     """Creates the sheet of hair that hangs down from the shell to ``style.hanging_mm`` below the openings of the ears.
 
     Args:
@@ -334,7 +334,7 @@ def _envelope(points: Points, unit: float, length_mm: float) -> Float[np.ndarray
     return np.asarray(cv2.morphologyEx(radius, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)), np.float32)
 
 
-def knot(shell: Hair, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
+def make_bun(shell: Hair, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
     """Creates a bun of twisted hair on the crown, with the radius ``style.bun_mm``."""
     elevation = np.radians(BUN_ELEVATION_DEG)
     outward = np.array([0.0, np.sin(elevation), -np.cos(elevation)])

@@ -17,10 +17,10 @@ from rig.render.photograph import NOISE_CELLS, Gallery, Grain, Part
 from rig.render.renderer import Renderer
 from rig.studio.scene.anatomy import Anatomy, Landmarks, anatomy
 from rig.studio.scene.eyes import IRIS_TONES, Eye, eye_centres, look_at_point, open_lids, surface
-from rig.studio.scene.hair import STRAND_POINTS, Hair, HairStyle, grow, grow_beard, hang, knot
+from rig.studio.scene.hair import STRAND_POINTS, Hair, HairStyle, grow, grow_beard, make_bun, make_hanging_hair
 from rig.studio.scene.lights import LAMPS, Lamp, irradiance, lamp_directions
 from rig.studio.scene.skin_texture import oily_zones, skin_paint
-from rig.studio.scene.worn import TightCap, cap, glasses, joined, lay_cap, shirt
+from rig.studio.scene.worn import TightCap, join_surfaces, lay_cap, make_cap, make_glasses, make_shirt
 from rig.studio.sensor.sensor import volume
 
 Vertices = Float[np.ndarray, "v 3"]
@@ -124,9 +124,9 @@ class Look:
     stubble: float = 0.0
     texture: bool = True
     beard: HairStyle | None = None
-    cap: Colour | None = None
+    make_cap: Colour | None = None
     tight_cap: TightCap | None = None
-    glasses: bool = False
+    make_glasses: bool = False
     pores: float = 1.0  # contrast, by the painted one
     oil: float = 0.0
     scattering_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -215,7 +215,7 @@ def dress(
     """Adds hair, clothes, skin colours and light to a head. Returns the subject in the world frame (mm)."""
     hair_rng, cloth_rng, noise_rng, strand_rng, skin_rng, eye_rng, cap_rng = rng.spawn(7)
     head, body = subject.mesh, anatomy(subject.mesh.vertices, subject.landmarks)
-    worn = shirt(head, body, cloth_rng) if clothes else None
+    worn = make_shirt(head, body, cloth_rng) if clothes else None
     hairs = _hairs(head, body, appearance, worn, hair_rng)
     pierced = replace(subject, mesh=open_lids(head, body.landmarks)) if subject.eyes else subject
     pieces = [_skin(pierced, body, appearance, worn is not None, skin_rng)]  # a shirt hides the cut through the neck
@@ -230,7 +230,7 @@ def dress(
         pieces.append(_tight_cap(head, body, appearance.tight_cap, cap_rng))
     placed = [(world_from_head.apply(piece.vertices), piece.faces) for piece in pieces]
     normals = [vertex_normals(*piece) for piece in placed]
-    solid = joined(placed)
+    solid = join_surfaces(placed)
     light = irradiance(renderer, [(v, n) for (v, _), n in zip(placed, normals, strict=True)], solid, lamps)
     if max(appearance.scattering_mm) > 0.0:
         light[0] = scatter_light(*placed[0], light[0], appearance.scattering_mm)
@@ -248,7 +248,7 @@ def dress(
     )
     shown = [piece.shows for piece in pieces]
     surfaces = {
-        name: Mesh(*joined([mesh for mesh, one in zip(placed, shown, strict=True) if one == name]))
+        name: Mesh(*join_surfaces([mesh for mesh, one in zip(placed, shown, strict=True) if one == name]))
         for name in dict.fromkeys(("head", *shown))
     }
     bare = parts[0] if pierced is subject else _uncut(parts[0], head)
@@ -306,9 +306,9 @@ def _hairs(
         styles.append((scalp, appearance.hair))
         if appearance.hair.hanging_mm:
             solid = np.concatenate([head.vertices, worn[0]]) if worn else head.vertices
-            styles.append((hang(scalp, solid, body, appearance.hair, rng), appearance.hair))
+            styles.append((make_hanging_hair(scalp, solid, body, appearance.hair, rng), appearance.hair))
         if appearance.hair.bun_mm:
-            styles.append((knot(scalp, body, appearance.hair, rng), appearance.hair))
+            styles.append((make_bun(scalp, body, appearance.hair, rng), appearance.hair))
     if appearance.beard:
         styles.append((grow_beard(head, body, appearance.beard, rng), appearance.beard))
     return styles
@@ -323,11 +323,11 @@ def _hair_piece(hair: Hair, style: HairStyle) -> Piece:
 def _headwear(head: Mesh, body: Anatomy, appearance: Look, scalp: Hair | None) -> list[Piece]:
     pieces = []
     if appearance.cap:
-        surface = cap(head.vertices, scalp.shell if scalp else None, body)
+        surface = make_cap(head.vertices, scalp.shell if scalp else None, body)
         grain = CLOTH if appearance.texture else NO_GRAIN
         pieces.append(Piece("clothes", *surface, surface[0], _even(surface[0], appearance.cap), grain, False))
     if appearance.glasses:
-        surface = glasses(head.vertices, body)
+        surface = make_glasses(head.vertices, body)
         pieces.append(Piece("clothes", *surface, surface[0], _even(surface[0], FRAME_TONE), FRAME, False))
     return pieces
 

@@ -83,7 +83,7 @@ def above_edge_mm(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np
     return (relative[:, 1] - np.interp(relative[:, 2], EDGE[:, 0], EDGE[:, 1])) * body.unit
 
 
-def cap(head: Float[np.ndarray, "n 3"], hair: Float[np.ndarray, "m 3"] | None, body: Anatomy) -> Surface:
+def make_cap(head: Float[np.ndarray, "n 3"], hair: Float[np.ndarray, "m 3"] | None, body: Anatomy) -> Surface:
     """Creates a cap that fits over a head and its hair (head frame, mm)."""
     centre = body.ears + np.array([0.0, 28.0, -6.0]) * body.unit
     radius = outer_radius(head - centre, open_ears=True)
@@ -108,7 +108,7 @@ def cap(head: Float[np.ndarray, "n 3"], hair: Float[np.ndarray, "m 3"] | None, b
     grid = np.concatenate([crown, hem])
     vertices, faces = grid.reshape(-1, 3), grid_faces(CAP_ROWS + 1, COLUMNS)
     shell = vertices, turned_along(vertices, faces, vertices - centre)
-    return joined([shell, _visor(crown[-1], azimuth, body)])
+    return join_surfaces([shell, _visor(crown[-1], azimuth, body)])
 
 
 def _visor(rim: Float[np.ndarray, "c 3"], azimuth: Float[np.ndarray, " c"], body: Anatomy) -> Surface:
@@ -129,7 +129,7 @@ def _visor(rim: Float[np.ndarray, "c 3"], azimuth: Float[np.ndarray, " c"], body
     return vertices, faces if upward > 0 else faces[:, ::-1]
 
 
-def glasses(head: Vertices, body: Anatomy) -> AnySurface:
+def make_glasses(head: Vertices, body: Anatomy) -> AnySurface:
     """Creates glasses from a head's landmarks: two rims, a bridge and two temples (head frame, mm).
 
     Raises InputError for a head without landmarks.
@@ -153,7 +153,7 @@ def glasses(head: Vertices, body: Anatomy) -> AnySurface:
     t = np.linspace(0.0, 1.0, 16)[:, None]
     arch = 4 * t * (1 - t) * np.array([0.0, 3.0, 5.0])
     bridge = (1 - t) * inner["right"] + t * inner["left"] + arch
-    return joined([*pieces, _tube(bridge, RIM_MM, np.array([0.0, 0.0, 1.0]), closed=False)])
+    return join_surfaces([*pieces, _tube(bridge, RIM_MM, np.array([0.0, 0.0, 1.0]), closed=False)])
 
 
 def _temple(head: Vertices, body: Anatomy, start: Vector, sign: float) -> Float[np.ndarray, "n 3"]:
@@ -190,14 +190,14 @@ def _tube(path: Float[np.ndarray, "n 3"], radius_mm: float, reference: Vector, *
     return vertices, turned_along(vertices, faces, vertices - np.repeat(middle, SIDES, axis=0))
 
 
-def joined(surfaces: list[AnySurface]) -> AnySurface:
+def join_surfaces(surfaces: list[AnySurface]) -> AnySurface:
     """Merges several surfaces into one, with renumbered triangles."""
     starts = np.cumsum([0] + [len(vertices) for vertices, _ in surfaces])
     faces = [faces + start for (_, faces), start in zip(surfaces, starts[:-1], strict=True)]
     return np.concatenate([vertices for vertices, _ in surfaces]), np.concatenate(faces)
 
 
-def shirt(
+def make_shirt(
     head: Mesh, body: Anatomy, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "s 3"], Int[np.ndarray, "f 3"]] | None:
     """Creates a shirt for a head whose mesh ends at the neck, as vertices (head frame, mm) and outward faces. Returns

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.adjustment.bundle import HUBER, BundleSolution, CornerTerm, Free, bundle_problem
+from calibration.adjustment.bundle import HUBER, BundleSolution, CornerTerm, Free, build_bundle_problem
 from calibration.adjustment.gauge import align_world, gauge_projection, image_distance, image_sigma, world_motions
 from calibration.adjustment.lens_prior import LensPrior, weak_prior
-from calibration.adjustment.state import PER_CAMERA, PER_SHOT, Observations, observations, residuals
+from calibration.adjustment.state import PER_CAMERA, PER_SHOT, Observations, observe_views, residuals
 from calibration.board.board import Board
 from calibration.calibrate import calibrate_detections
 from pipeline.estimation.levenberg_marquardt import Evidence
@@ -20,7 +20,7 @@ from tests.support.changed_rigs import reposed
 
 def seen_in(source: Session) -> Observations:
     d = source.detections
-    return observations(d.views, source.rig.names, d.shots, d.board)
+    return observe_views(d.views, source.rig.names, d.shots, d.board)
 
 
 def test_the_bundle_projects_as_the_cameras_do() -> None:
@@ -63,7 +63,7 @@ def bound(source: Session) -> np.ndarray:
     state, seen = planted(source), seen_in(source)
     prior = weak_prior(list(source.detections.sizes.values()))
     nothing = LensPrior(state.intrinsics, prior.information * 1e-6)
-    problem = bundle_problem(state, CornerTerm(seen, np.full(len(source.rig), 0.2)), nothing, Free())
+    problem = build_bundle_problem(state, CornerTerm(seen, np.full(len(source.rig), 0.2)), nothing, Free())
     here = problem.at(state)
     evidence = Evidence("converged", 1, 0, here.cost)
     assert problem.free is not None

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from calibration.adjustment.intrinsics import Lens
-from calibration.adjustment.state import BundleState, observations
+from calibration.adjustment.state import BundleState, observe_views
 from calibration.board.detection import View
 from calibration.quality.outliers import (
     VIEW_LEAST_PX,
     VIEW_RATIO,
     Dropped,
     bad_views,
-    board_scale,
     drop_blurred,
     drop_misread,
+    estimate_board_scale,
     explain_shot,
     miss,
     square_side_px,
@@ -107,7 +107,7 @@ def test_a_view_that_its_own_lens_does_not_explain_is_left_out(good: Session) ->
 
 def test_bad_views_are_those_far_beyond_the_median(good: Session, state: BundleState) -> None:
     views, names, shots = list(good.detections.views), list(good.rig.names), list(good.poses)
-    rms = view_rms(state, observations(views, names, shots, CHECKERBOARD))
+    rms = view_rms(state, observe_views(views, names, shots, CHECKERBOARD))
     for view, found_px in zip(views, rms, strict=True):
         corners = good.poses[view.shot].apply(CHECKERBOARD.corners()[view.found.ids])
         off = good.rig[view.camera].project(corners) - view.found.corners
@@ -115,7 +115,7 @@ def test_bad_views_are_those_far_beyond_the_median(good: Session, state: BundleS
     limit = max(VIEW_RATIO * float(np.median(rms)), VIEW_LEAST_PX)
     for shift, bad in ((0.8 * limit, False), (1.2 * limit, True)):
         views[5] = with_corners(good.detections.views[5], good.detections.views[5].found.corners + [shift, 0.0])
-        found = bad_views(state, observations(views, names, shots, CHECKERBOARD))
+        found = bad_views(state, observe_views(views, names, shots, CHECKERBOARD))
         assert found[5] == bad
         assert found.sum() == bad
 
@@ -141,13 +141,13 @@ def test_a_board_of_other_squares_is_measured(good: Session, state: BundleState,
     other = replace(CHECKERBOARD, square_mm=square_mm)
     views = [with_corners(v, visible(good.rig[v.camera], good.poses[SHOT], other)[1]) for v in of_shot(good)]
     cameras = {camera.name: camera for camera in good.rig}
-    scale = board_scale(views, cameras, CHECKERBOARD, good.poses[SHOT])
+    scale = estimate_board_scale(views, cameras, CHECKERBOARD, good.poses[SHOT])
     assert scale is not None
     np.testing.assert_allclose(scale, (square_mm / 25.0, 0.0), atol=1e-6)
     (drop,) = explained(good, state, views, views[:1])
     assert (drop.camera, drop.reason.code) == (None, "squares-of-other-board")
     assert f"{square_mm:.1f} mm" in drop.reason.text
-    assert board_scale(views[:1], cameras, CHECKERBOARD, good.poses[SHOT]) is None, "one camera tells no size"
+    assert estimate_board_scale(views[:1], cameras, CHECKERBOARD, good.poses[SHOT]) is None, "one camera tells no size"
 
 
 def test_a_picture_under_another_name_says_whose_it_is(good: Session, state: BundleState) -> None:

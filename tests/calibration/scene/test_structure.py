@@ -5,7 +5,7 @@ import pytest
 
 from calibration.adjustment.gauge import image_distance
 from calibration.scene.matching import Matches
-from calibration.scene.structure import why_not
+from calibration.scene.structure import explain_missing_view
 from tests.support.textured_wedge import on_wedge, solved, wedge_rig
 
 
@@ -48,4 +48,4 @@ def test_a_view_that_does_not_join_is_told_why(name: str, reason: str) -> None:
     if name == "far":
         matched["far", "farther"] = 10
     matches = Matches((), False, dict.fromkeys(features, (640, 480)), features, matched, 0)
-    assert why_not(name, matches, ("near",)).text.startswith(reason)
+    assert explain_missing_view(name, matches, ("near",)).text.startswith(reason)

@@ -12,8 +12,8 @@ from pipeline.alignment.feature_checks import feature_faults
 from pipeline.alignment.landmarks import (
     TooFewFeatures,
     WrongFeatures,
+    align_by_features,
     consensus,
-    feature_alignment,
     landmark_statistics,
 )
 from pipeline.geometry.registration.rigid import generalised_procrustes, procrustes
@@ -133,7 +133,7 @@ def picked(model: HeadModel, pose: Similarity, names: tuple[str, ...], z: np.nda
 
 def test_the_mean_head_is_found_where_it_stands(model: HeadModel) -> None:
     pose = Similarity(1.0, rotation_from_vector(np.array([0.1, -0.4, 0.05])), np.array([15.0, -20.0, 30.0]))
-    found = feature_alignment(model, picked(model, pose, SEVEN_POINTS), RIG).world_from_head
+    found = align_by_features(model, picked(model, pose, SEVEN_POINTS), RIG).world_from_head
     np.testing.assert_allclose(found.rotation, pose.rotation, atol=1e-6)
     np.testing.assert_allclose(found.translation, pose.translation, atol=1e-3)
 
@@ -142,7 +142,7 @@ def test_a_confused_landmark_is_named_and_does_not_turn_the_head(model: HeadMode
     pose = Similarity(1.0, np.eye(3), np.array([5.0, 0.0, 0.0]))
     features = {**picked(model, pose, SEVEN_POINTS)}
     features["exocanthion_right"] = features["exocanthion_left"]
-    found = feature_alignment(model, features, RIG)
+    found = align_by_features(model, features, RIG)
     (off,) = [remark.text for remark in found.remarks if remark.code == "feature-off"]
     assert "exocanthion_right is left out, because it lies" in off
     np.testing.assert_allclose(found.world_from_head.rotation, np.eye(3), atol=1e-6)
@@ -151,30 +151,30 @@ def test_a_confused_landmark_is_named_and_does_not_turn_the_head(model: HeadMode
 def test_too_few_points_and_points_on_a_line_say_what_to_do(model: HeadModel) -> None:
     two = picked(model, Similarity.identity(), SEVEN_POINTS[:2])
     with pytest.raises(TooFewFeatures, match=r"2 points are usable.*Pick more points"):
-        feature_alignment(model, two, RIG)
+        align_by_features(model, two, RIG)
     single = {**two, "gnathion": {"front": np.array([500.0, 400.0])}, "my_point": two["exocanthion_left"]}
     with pytest.raises(TooFewFeatures, match=r"gnathion is left out.*is picked in 1 view.*my_point is no landmark"):
-        feature_alignment(model, single, RIG)
+        align_by_features(model, single, RIG)
     midline = picked(model, Similarity.identity(), ("stomion", "labiale_superius", "labiale_inferius"))
     with pytest.raises(TooFewFeatures, match="on one line"):
-        feature_alignment(model, midline, RIG)
+        align_by_features(model, midline, RIG)
 
 
 def test_sides_that_are_the_viewer_s_and_numbers_in_place_of_names_are_named(model: HeadModel) -> None:
     features = picked(model, Similarity(1.0, np.eye(3), np.array([5.0, 0.0, 0.0])), NAMES)
     exchanged = {mirrored(name): views for name, views in features.items()}
     with pytest.raises(WrongFeatures, match="once right and left are exchanged"):
-        feature_alignment(model, exchanged, RIG)
+        align_by_features(model, exchanged, RIG)
     numbered = {str(number): views for number, views in enumerate(features.values())}
     with pytest.raises(WrongFeatures, match=r"no point has the name of a landmark \(0, 1, 2, 3 and"):
-        feature_alignment(model, numbered, RIG)
+        align_by_features(model, numbered, RIG)
 
 
 def test_rows_and_columns_that_are_exchanged_are_named(model: HeadModel) -> None:
     features = picked(model, Similarity(1.0, np.eye(3), np.array([45.0, 0.0, 0.0])), SEVEN_POINTS)
     exchanged = {name: {camera: at[::-1] for camera, at in views.items()} for name, views in features.items()}
     with pytest.raises(WrongFeatures, match=r"write each as \[column, row\]"):
-        feature_alignment(model, exchanged, RIG)
+        align_by_features(model, exchanged, RIG)
     (fault,) = feature_faults(exchanged, RIG)
     assert "once rows and columns are exchanged" in fault.text
 

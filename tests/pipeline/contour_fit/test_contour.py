@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.contour_fit.contour import schedule
-from pipeline.contour_fit.head_problem import head_problem
+from pipeline.contour_fit.head_problem import build_head_problem
 from pipeline.contour_fit.noise_model import estimate_unit
 from pipeline.contour_fit.posterior import vertex_deviation_mm
 from pipeline.contour_fit.problem import PER_CAMERA, State, first_evidence, make_problem, widen
@@ -128,8 +128,8 @@ def test_feature_points_follow_a_wider_model(model, planted):
     wide = widen(problem, model, ("p95",))
     stage, evidence = schedule(SETTINGS, 20)[0], first_evidence(SETTINGS)
     none = np.zeros((len(rig), PER_CAMERA))
-    narrow_cost = head_problem(problem, evidence, stage, 3.0).at(State(coefficients[:20], pose, none)).cost
+    narrow_cost = build_head_problem(problem, evidence, stage, 3.0).at(State(coefficients[:20], pose, none)).cost
     padded = np.concatenate([coefficients[:20], np.zeros(len(model.modes) - 20)])
-    assert head_problem(wide, evidence, stage, 3.0).at(State(padded, pose, none)).cost == pytest.approx(
+    assert build_head_problem(wide, evidence, stage, 3.0).at(State(padded, pose, none)).cost == pytest.approx(
         narrow_cost, rel=1e-5
     )

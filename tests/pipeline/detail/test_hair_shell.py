@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.detail.hair_shell import MIN_COVERED, covered_share, hair_shell
+from pipeline.detail.hair_shell import MIN_COVERED, covered_share, move_to_hair
 from pipeline.part_labels.codes import Part
 from rig.mesh import Mesh
 
@@ -30,7 +30,7 @@ def capped() -> tuple[Mesh, Mesh, np.ndarray]:
 
 def test_hair_is_covered_and_skin_stays(capped: tuple[Mesh, Mesh, np.ndarray]) -> None:
     head, bust, part = capped
-    made = hair_shell(head, bust, part)
+    made = move_to_hair(head, bust, part)
     assert covered_share(head, bust, part) < 0.1
     assert made.covered > 0.98
     skin = head.vertices[:, 1] < -0.1 * HEAD_MM
@@ -42,10 +42,10 @@ def test_hair_is_covered_and_skin_stays(capped: tuple[Mesh, Mesh, np.ndarray]) -
 def test_no_vertex_lies_in_the_skin_and_a_head_without_hair_is_the_head(capped: tuple[Mesh, Mesh, np.ndarray]) -> None:
     head, bust, part = capped
     sunk = Mesh(bust.vertices * np.where(part == Part.HAIR, 1.0, 0.97)[:, None], bust.faces)
-    made = hair_shell(head, sunk, part)
+    made = move_to_hair(head, sunk, part)
     inner = HEAD_MM * np.cos(np.radians(2.5))  # the middle of the ball's triangles
     assert np.linalg.norm(made.vertices_world, axis=1).min() > inner
-    bald = hair_shell(head, bust, np.zeros_like(part))
+    bald = move_to_hair(head, bust, np.zeros_like(part))
     np.testing.assert_array_equal(bald.vertices_world, head.vertices)
     assert bald.covered == 1.0
 
@@ -55,6 +55,6 @@ def test_hair_that_hangs_beside_the_head_is_not_reached(capped: tuple[Mesh, Mesh
     curtain = trimesh.creation.box((4.0, 150.0, 100.0)).subdivide().subdivide().subdivide().subdivide()
     hanging = np.asarray(curtain.vertices) + (110.0, -120.0, 0.0)
     both = Mesh(np.concatenate([bust.vertices, hanging]), np.concatenate([bust.faces, curtain.faces + len(part)]))
-    made = hair_shell(head, both, np.concatenate([part, np.full(len(hanging), Part.HAIR, np.uint8)]))
+    made = move_to_hair(head, both, np.concatenate([part, np.full(len(hanging), Part.HAIR, np.uint8)]))
     assert made.covered < MIN_COVERED
     assert np.linalg.norm(made.vertices_world, axis=1).max() < 1.1 * HAIR_MM

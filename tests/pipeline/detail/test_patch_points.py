@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.contour_fit.fit import Fit
-from pipeline.detail.patch_points import PatchSearch, patch_search
+from pipeline.detail.patch_points import PatchSearch, prepare_patch_search
 from rig.geometry import Similarity
 from rig.mesh import vertex_normals
 from tests.support.photo_scene import Scene, ellipsoid_model, fine_waves, photograph
@@ -20,7 +20,7 @@ def search(scene: Scene, hair: float = 0.0) -> PatchSearch:
     fit = Fit("contour", np.zeros(0), Similarity.identity(), 1, "planted")
     distances = {name: silhouette.distance for name, silhouette in scene.silhouettes.items()}
     shown = {name: np.full(image.shape[:2], hair, np.float32) for name, image in scene.images.items()}
-    return patch_search(scene.model, fit, scene.images, distances, shown, scene.rig)
+    return prepare_patch_search(scene.model, fit, scene.images, distances, shown, scene.rig)
 
 
 @pytest.mark.parametrize("off_mm", [0.0, 0.4])

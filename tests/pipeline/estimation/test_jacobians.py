@@ -14,7 +14,7 @@ import pytest
 from calibration.adjustment.bundle import CornerTerm
 from calibration.adjustment.lens_prior import AspectTerm
 from calibration.adjustment.state import PER_CAMERA as PER_BUNDLE_CAMERA
-from calibration.adjustment.state import PER_SHOT, BundleState, Observations, moved_state, observations
+from calibration.adjustment.state import PER_SHOT, BundleState, Observations, moved_state, observe_views
 from calibration.silhouette_refinement.tangency_term import PackedTangencies, TangencyTerm
 from pipeline.contour_fit.head_problem import FeatureTerm, apply_step
 from pipeline.contour_fit.landmark_term import LandmarkTerm, observe_landmarks
@@ -83,7 +83,7 @@ def small_bundle() -> tuple[BundleState, Observations]:
     source, rng = session(cameras=3, shots=5, seed=1), np.random.default_rng(0)
     d, velocities = source.detections, rng.normal(size=(5, 6)) * [0.01, 0.01, 0.01, 10, 10, 10]
     state = replace(planted(source), velocities=velocities)
-    return state, observations(d.views, source.rig.names, d.shots, d.board)
+    return state, observe_views(d.views, source.rig.names, d.shots, d.board)
 
 
 def corners() -> Case:

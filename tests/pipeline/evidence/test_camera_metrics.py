@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pipeline.contour_fit.fit import Fit
-from pipeline.evidence.camera_metrics import camera_figures, start_masks
+from pipeline.evidence.camera_metrics import measure_cameras, start_masks
 from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import silhouette_from_mask
 from rig.geometry import Similarity
@@ -33,7 +33,7 @@ def test_only_what_reaches_beyond_the_outline_contradicts_it() -> None:
     masks = {small: grown(exact[small], -4), right: exact[right], large: grown(exact[large], 30)}
     silhouettes = {name: silhouette_from_mask(mask) for name, mask in masks.items()}
     fit = Fit("contour", np.zeros(0), place, 1, "converged")
-    found = camera_figures(model, fit, silhouettes, rig, exact, exact)
+    found = measure_cameras(model, fit, silhouettes, rig, exact, exact)
     assert found[small].outside_rms_px == pytest.approx(4.0, abs=1.0)
     assert known(found[right].outside_rms_px) < 0.5
     assert found[large].outside_rms_px == 0.0

@@ -11,9 +11,9 @@ from pipeline.fusion.hair import (
     INSET_MM,
     OFF_HEAD_MM,
     STUBBLE_MM,
+    correct_parts,
     extend_to_outlines,
     loosen_hair,
-    parts_over_head,
     smooth_unresolved,
 )
 from pipeline.fusion.refinement import SeenVertices
@@ -103,7 +103,7 @@ def test_height_over_the_head_decides_between_skin_and_hair(height_mm: float, sh
     places = ball(OUTLINE_MM + height_mm).vertices[::20]
     cells = np.tile((np.arange(3) == shown.channel).astype(float), (len(places), 1))
     votes = PartVotes(places.min(axis=0), np.array([40, 40, 40]), np.arange(len(places)), places, cells)
-    shares = parts_over_head(votes, ball(OUTLINE_MM)).probability
+    shares = correct_parts(votes, ball(OUTLINE_MM)).probability
     assert (shares[:, part.channel] > 0.99).all()
 
 
@@ -114,7 +114,7 @@ def test_neither_a_neck_off_the_head_nor_a_chest_below_it_is_hair() -> None:
     used, joined = np.unique(kept, return_inverse=True)
     neck = Mesh(head.vertices[used], joined.reshape(-1, 3).astype(np.int32))
     votes = PartVotes(places.min(axis=0), np.array([9, 99, 99]), np.arange(3), places, np.tile([1.0, 0.0, 0.0], (3, 1)))
-    assert parts_over_head(votes, neck).probability[:, Part.SKIN.channel].tolist() == [1.0, 1.0, 0.0]
+    assert correct_parts(votes, neck).probability[:, Part.SKIN.channel].tolist() == [1.0, 1.0, 0.0]
 
 
 def test_scatter_of_strands_is_smoothed_and_skin_stays() -> None:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.imaging.grey import blur_growth, noise_left, noise_level
+from pipeline.imaging.grey import blur_growth, estimate_noise, noise_left
 
 
 @pytest.mark.parametrize("sigma_px", [0.5, 0.7, 0.84, 1.2])
@@ -19,7 +19,7 @@ def test_noise_level_on_a_ramp_with_edges(levels: float) -> None:
     image = np.add.outer(np.linspace(40, 90, 300), np.linspace(0, 80, 400)).astype(np.float32)
     image[100:200, 150:250] += 60.0
     image += np.random.default_rng(1).normal(0.0, levels, image.shape).astype(np.float32)
-    assert noise_level(image) == pytest.approx(levels, rel=0.05)
+    assert estimate_noise(image) == pytest.approx(levels, rel=0.05)
 
 
 def test_quiet_photographs_are_blurred_as_ever() -> None:

@@ -29,7 +29,7 @@ from pipeline.results.report import report_document, skin_document
 from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings, settings_from_document
 from pipeline.texturing.albedo import Albedo
-from pipeline.texturing.layout.normal_map import reduced_layout
+from pipeline.texturing.layout.normal_map import reduce_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, model_layout
 from pipeline.texturing.light import Light
 from pipeline.texturing.pores.skin_maps import SkinMaps, codes_of
@@ -63,7 +63,7 @@ def result() -> Reconstruction:
 def reduced_result(result: Reconstruction) -> Reconstruction:
     texturing = result.texturing
     assert texturing.atlas is not None
-    reduced = reduced_layout(load_model(), texturing.atlas.layout)
+    reduced = reduce_layout(load_model(), texturing.atlas.layout)
     return replace(result, texturing=replace(texturing, reduced=reduced))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.stereo.depth_map import DepthMap, points_world
-from pipeline.stereo.estimate import estimate_depth, take_specks_off
+from pipeline.stereo.estimate import estimate_depth, replace_specks
 from rig.camera import Distortion
 from rig.rig import Rig
 from tests.pipeline.stereo.ray_scene import Ball, fan, first_hit, shoot
@@ -99,7 +99,7 @@ def test_piece_at_the_edge_of_the_picture_or_at_an_outline_stays() -> None:
     outline[:, 30:], outline[10:14, 27:30] = 0.0, 780.0
     for depth in (edge, outline):
         before = depth.copy()
-        assert not take_specks_off(depth, slopes, PIXEL_MM, MOST_PX).any()
+        assert not replace_specks(depth, slopes, PIXEL_MM, MOST_PX).any()
         assert (depth == before).all()
 
 
@@ -107,7 +107,7 @@ def test_pieces_beside_each_other_stay_where_together_they_are_large() -> None:
     depth, slopes = level()
     depth[10:15, 10:15], depth[10:15, 15:20] = 820.0, 840.0
     depth[25:29, 10:13], depth[25:29, 13:16] = 820.0, 840.0
-    specks = take_specks_off(depth, slopes, PIXEL_MM, MOST_PX)
+    specks = replace_specks(depth, slopes, PIXEL_MM, MOST_PX)
     assert not specks[:20].any()
     assert specks[25:29, 10:16].all()
     assert specks.sum() == 24

@@ -13,8 +13,8 @@ from pipeline.stereo.estimate import (
     PIXEL_MM,
     SEARCH_PIXEL_MM,
     choose_neighbours,
+    find_fields,
     find_search_level,
-    first_fields,
     slopes_around,
     square_pattern,
 )
@@ -75,7 +75,7 @@ def test_places_are_found_where_the_bounds_slope_otherwise_than_the_surface(monk
     for z in true:
         near, far = (np.where(np.isfinite(z), z + off, 0.0).astype(np.float32) for off in (-40.0, 35.0))
         ranges.append(DepthRange(near, far, np.full((*z.shape, 4), 3.0, np.float32)))
-    fields = first_fields(matching, ranges)
+    fields = find_fields(matching, ranges)
     right = np.concatenate([(np.abs(f.depth - z) < 3.0)[np.isfinite(z)] for f, z in zip(fields, true, strict=True)])
     assert right.mean() > 0.75  # 0.86; below 0.5 with the bounds' slopes
 

@@ -5,7 +5,7 @@ import numpy as np
 from pipeline.imaging.colour_chart import Chart, ChartCorrection, true_colours
 from pipeline.texturing.chart_colours import (
     ChartColours,
-    colours_of_charts,
+    combine_charts,
     correct_capture,
     correct_picture,
     levelled_by_chart,
@@ -43,7 +43,7 @@ def test_a_chart_corrects_its_camera_and_the_mean_the_others() -> None:
     rig = default_layout()
     one, other, bare = rig.names[3:6]
     charts = {one: [seen_in(rig[one], np.diag([0.5, 0.8, 0.8]))], other: [seen_in(rig[other], np.eye(3))], bare: []}
-    colours, warnings = colours_of_charts(charts, rig)
+    colours, warnings = combine_charts(charts, rig)
     assert colours is not None
     assert not warnings
     assert set(colours.cameras) == {one, other}

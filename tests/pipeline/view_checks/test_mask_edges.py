@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
-from pipeline.view_checks.mask_edges import edge_beside, find_turned_masks, masks_alone_exchanged, masks_off_edges
+from pipeline.view_checks.mask_edges import find_edge, find_turned_masks, masks_alone_exchanged, masks_off_edges
 
 NAMES = ("cam00", "cam01", "cam02")
 
@@ -38,7 +38,7 @@ IMAGES = {name: photograph(k) for k, name in enumerate(NAMES)}
 
 @pytest.mark.parametrize("px", [0, 5, -5])
 def test_the_edge_of_the_photograph_is_found_beside_the_outline(px: int) -> None:
-    edge = edge_beside(IMAGES["cam01"], grown(subject(1), px))
+    edge = find_edge(IMAGES["cam01"], grown(subject(1), px))
     assert edge is not None
     assert edge.offset_px == pytest.approx(-px, abs=1.0)
     assert edge.is_off == (px != 0)

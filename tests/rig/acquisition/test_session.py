@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rig.acquisition.commands import COLUMNS, NoCalibration, board_shots, capture, check, preview, take_plates
+from rig.acquisition.commands import COLUMNS, NoCalibration, capture, check, preview, take_board_shots, take_plates
 from rig.acquisition.judgement import PlatesRefused
 from rig.acquisition.plates import plates_versions, read_plates, write_plates
 from rig.acquisition.session import RigSession
@@ -275,9 +275,9 @@ def test_every_warning_is_a_fault_that_is_explained() -> None:
 def test_board_shots_need_no_calibration_nor_plates(studio: StudioDevices, config: RigConfig, tmp_path: Path) -> None:
     bare = dataclasses.replace(config, calibration=None, plates=str(tmp_path / "none"))
     studio.inject(DeviceFault("hung", "cam02"))
-    taken = list(board_shots(bare, tmp_path / "board", 1, pause_s=0.0))
+    taken = list(take_board_shots(bare, tmp_path / "board", 1, pause_s=0.0))
     studio.clear()
-    taken += list(board_shots(bare, tmp_path / "board", 1, pause_s=0.0))
+    taken += list(take_board_shots(bare, tmp_path / "board", 1, pause_s=0.0))
     assert [(name, cameras) for name, cameras, _ in taken] == [("shot000", THREE[:2]), ("shot001", THREE)]
     assert [[(f.code, f.camera) for f in faults] for _, _, faults in taken] == [[("missing", "cam02")], []]
     found = sorted(path.relative_to(tmp_path / "board").as_posix() for path in (tmp_path / "board").rglob("*.png"))
@@ -288,5 +288,5 @@ def test_board_shots_need_no_calibration_nor_plates(studio: StudioDevices, confi
 def test_board_shots_stop_where_nothing_fires(studio: StudioDevices, config: RigConfig, tmp_path: Path) -> None:
     studio.inject(DeviceFault("unplugged"))
     with pytest.raises(ShotFailed, match="trigger"):
-        list(board_shots(config, tmp_path / "board", 3, pause_s=0.0))
+        list(take_board_shots(config, tmp_path / "board", 3, pause_s=0.0))
     assert not (tmp_path / "board").exists()

@@ -9,11 +9,11 @@ from rig.errors import InputError
 from rig.mesh import Mesh, face_normals, vertex_normals
 from rig.render.renderer import Renderer
 from rig.studio.scene.anatomy import Anatomy, anatomy, finer_grid
-from rig.studio.scene.hair import HairStyle, add_curls, beard_share, grow, hang, knot
+from rig.studio.scene.hair import HairStyle, add_curls, beard_share, grow, make_bun, make_hanging_hair
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.subject import HAIRSTYLES, Look, Subject, dress, restyle
-from rig.studio.scene.worn import cap, glasses
+from rig.studio.scene.worn import make_cap, make_glasses
 from tests.rig.studio.test_images import egg_head
 from tests.support.small_studio import CLEAN
 
@@ -69,7 +69,7 @@ def test_curls_stay_about_the_smooth_hair(head, body):
 def test_long_hair_ends_where_it_should_and_outside_the_neck(head, body):
     style = replace(CALM, hanging_mm=120.0)
     scalp = grow(head.vertices, body, style, rng())
-    sheet = hang(scalp, head.vertices, body, style, rng())
+    sheet = make_hanging_hair(scalp, head.vertices, body, style, rng())
     lowest = sheet.shell[:, 1].min()
     assert abs(body.ears[1] - 120.0 * body.unit - lowest) < 30.0  # ends are ragged by 7 mm, standard deviation
     behind = np.abs(sheet.shell[:, 0]) < 20
@@ -85,8 +85,8 @@ def test_long_hair_rests_on_the_shoulders(head, body):
     reach = 60 + 0.8 * (drop - 130)
     worn = body.ears + np.stack([reach * np.sin(turn), -drop, reach * np.cos(turn)], axis=-1).reshape(-1, 3)
     scalp = grow(head.vertices, body, style, rng())
-    free = hang(scalp, head.vertices, body, style, rng())
-    resting = hang(scalp, np.concatenate([head.vertices, worn]), body, style, rng())
+    free = make_hanging_hair(scalp, head.vertices, body, style, rng())
+    resting = make_hanging_hair(scalp, np.concatenate([head.vertices, worn]), body, style, rng())
     low = free.shell[:, 1] < body.ears[1] - 160 * body.unit
     radius = [np.hypot(*(hair.shell[low] - body.ears)[:, [0, 2]].T) for hair in (free, resting)]
     assert np.median(radius[1] - radius[0]) > 4.0
@@ -95,7 +95,7 @@ def test_long_hair_rests_on_the_shoulders(head, body):
 def test_bun_sits_on_the_crown(head, body):
     style = replace(CALM, bun_mm=30.0)
     scalp = grow(head.vertices, body, style, rng())
-    bun = knot(scalp, body, style, rng())
+    bun = make_bun(scalp, body, style, rng())
     assert bun.shell[:, 1].max() > scalp.shell[:, 1].max() + 5.0
     assert np.ptp(bun.shell[:, 0]) == pytest.approx(60.0, rel=0.2)
     outward = (vertex_normals(bun.shell, bun.shell_faces) * (bun.shell - bun.shell.mean(axis=0))).sum(axis=1)
@@ -114,7 +114,7 @@ def test_beard_leaves_lips_cheeks_and_forehead_free(head, body):
 def test_cap_covers_the_crown_and_shades_no_ear(head, body):
     style = replace(CALM, over_ears=False)
     scalp = grow(head.vertices, body, style, rng())
-    vertices, _ = cap(head.vertices, scalp.shell, body)
+    vertices, _ = make_cap(head.vertices, scalp.shell, body)
     assert vertices[:, 1].max() > scalp.shell[:, 1].max()
     crown = scalp.shell[scalp.shell[:, 1] > body.ears[1] + 100 * body.unit]
     towards = (crown - body.ears) / np.linalg.norm(crown - body.ears, axis=1, keepdims=True)
@@ -127,7 +127,7 @@ def test_cap_covers_the_crown_and_shades_no_ear(head, body):
 
 
 def test_glasses_stand_before_the_eyes_and_reach_the_ears(head, body):
-    vertices, faces = glasses(head.vertices, body)
+    vertices, faces = make_glasses(head.vertices, body)
     eye = body.landmarks["exocanthion_left"]
     rim = vertices[np.hypot(vertices[:, 0] - eye[0], vertices[:, 1] - eye[1]) < 30]
     assert rim[:, 2].max() > eye[2]

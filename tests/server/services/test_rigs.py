@@ -18,7 +18,7 @@ from rig.messages.message import texts_of
 from rig.studio.devices.serve import DeviceFault, StudioDevices
 from rig.studio.scene.layout import default_layout
 from server.errors import Conflict, NotFound, Unavailable
-from server.services.rigs import RealRig, SimulatedRig, jpeg, reduced
+from server.services.rigs import RealRig, SimulatedRig, encode_jpeg, reduced
 from server.services.service import open_rig
 from server.settings import ServiceSettings
 from tests.rig.acquisition.test_session import flat_rig
@@ -163,7 +163,7 @@ def test_the_simulated_studio_has_no_settings(tmp_path: Path) -> None:
 def test_a_preview_is_no_wider_than_a_page_needs(width: int, height: int, expected: tuple[int, int]) -> None:
     image = np.full((height, width, 3), (200, 30, 10), np.uint8)
     assert reduced(image, 640).shape[:2] == expected
-    shown = cv2.imdecode(np.frombuffer(jpeg(image), np.uint8), cv2.IMREAD_COLOR)
+    shown = cv2.imdecode(np.frombuffer(encode_jpeg(image), np.uint8), cv2.IMREAD_COLOR)
     assert shown is not None
     assert shown.shape[:2] == expected
     assert np.abs(shown[:, :, ::-1].astype(int) - (200, 30, 10)).max() < 8  # red stays red

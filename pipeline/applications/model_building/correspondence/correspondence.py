@@ -40,9 +40,9 @@ from pipeline.geometry.registration.nonrigid import (
     Target,
     dots,
     draw_to_target,
-    landmark_warp,
     match_points,
     oriented_tree,
+    warp_by_landmarks,
 )
 from pipeline.geometry.registration.rigid import motion_columns, solve_with_prior
 from pipeline.head_model.landmarks import NAMES, stacked
@@ -247,7 +247,7 @@ def on_reference(target: Target, template: HeadModel) -> Float[np.ndarray, "V 3"
     """Returns the template's cage vertices moved onto the surface of the reference scan."""
     surface = template.vertices(np.zeros(0))[: len(template.mean)]
     index = _landmark_rows(template)
-    warped = landmark_warp(surface[index], target.marks, surface)
+    warped = warp_by_landmarks(surface[index], target.marks, surface)
     fixed = {int(row): mark for row, mark in zip(index, target.marks, strict=True)}
     faces = template.levels["cage"].faces
     return draw_to_target(warped, faces, target, BROAD, REFERENCE_STIFFNESS, marks=fixed, mark_weight=MARK_WEIGHT)
@@ -262,7 +262,7 @@ def warp_and_resample(
     """Warps the reference head to the scan's landmarks and resamples it on the scan's surface (steps 3 and 4 of the
     paper's section 3.2). Returns the warped head, the resampled head, and a mask of the vertices without surface, which
     stay at the warped position."""
-    warped = landmark_warp(shape[index], marks, shape, smoothing=MARK_SMOOTHING_MM)
+    warped = warp_by_landmarks(shape[index], marks, shape, smoothing=MARK_SMOOTHING_MM)
     angles, heights, radii = coordinates(warped)
     hits = cylinder.cast(angles, heights, radii)
     void = ~(np.abs(hits - radii) < SAMPLE_REACH_MM)
@@ -293,7 +293,7 @@ def statistical(
     Surface residuals are point-to-plane distances weighted by area (cm2); landmark residuals count along all three
     axes; six unknowns are the pose."""
     mean, areas = prior.mean, vertex_areas(prior.mean, faces)
-    shape = landmark_warp(mean[index], target.marks, mean, smoothing=20.0)
+    shape = warp_by_landmarks(mean[index], target.marks, mean, smoothing=20.0)
     points = np.concatenate([mean, np.repeat(mean[index], 3, axis=0)])  # a landmark is three planes
     for search, count in ((BROAD, prior.broad), (FINE, len(prior.modes))):
         tree = oriented_tree(target, search)

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.distance import cdist
 
 from pipeline.applications.model_building.training.training import Training, above_neck, face_region, finish
-from pipeline.geometry.registration.nonrigid import landmark_warp
+from pipeline.geometry.registration.nonrigid import warp_by_landmarks
 from pipeline.geometry.registration.rigid import motion_about, motion_columns, solve_with_prior
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.expressions import Expressions, visible
@@ -360,7 +360,7 @@ def complete_landmarks(mean: Vertices, faces: Int[np.ndarray, "F 3"], known: Map
     if len(shared) >= 4:
         here = np.array([fitted[default.landmarks[name]] for name in shared])
         # definitions of landmarks differ slightly between sources, so the warp approximates the known ones
-        at = landmark_warp(here, mean[[known[name] for name in shared]], at, smoothing=20.0)
+        at = warp_by_landmarks(here, mean[[known[name] for name in shared]], at, smoothing=20.0)
     at = _symmetric(at, mean, SurfaceIndex(mean, faces))
     ours = vertex_normals(fitted, default.levels["full"].faces)[[default.landmarks[name] for name in NAMES]]
     # normals count too: position alone would put the wing of the nose inside the nostril

@@ -21,7 +21,7 @@ from rig.errors import InputError
 from rig.progress import Progress
 
 FEWEST = 3  # heads; they give two modes, and each can be left out to measure generalisation
-_SHARPENINGS = 4  # steps of the iteration in ``cages_through``
+_SHARPENINGS = 4  # steps of the iteration in ``compute_cages``
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +50,7 @@ def build_model(
         )
     if len(good) < FEWEST:
         raise InputError(str(scans_folder), [f"{len(good)} sound scans, needed are {FEWEST}", *skipped.values()])
-    heads = cages_through(correspond([entry.scan for entry in good], template, report), template)
+    heads = compute_cages(correspond([entry.scan for entry in good], template, report), template)
     training = Training(
         name=name,
         licence="not stated",
@@ -85,7 +85,7 @@ def _read_and_check(template: HeadModel, path: Path) -> Checked | str:
         return str(fault)
 
 
-def cages_through(points: Float[np.ndarray, "N V0 3"], template: HeadModel) -> Float[np.ndarray, "N V0 3"]:
+def compute_cages(points: Float[np.ndarray, "N V0 3"], template: HeadModel) -> Float[np.ndarray, "N V0 3"]:
     """Computes coarse control meshes, called cages (mm), whose subdivision surface passes through given points.
 
     A subdivision surface lies inside its cage. The cage C must therefore solve S C = P, with the points P and the

@@ -67,7 +67,7 @@ def finish(
 ) -> ModelParts:
     """Builds the parts of a model file from its principal components. Decimated meshes are chosen on the mean head."""
     report("decimating", 0.0)
-    decimated = levels_of(components.mean, training.faces, region, training.landmarks, training.subdivisions)
+    decimated = decimate_levels(components.mean, training.faces, region, training.landmarks, training.subdivisions)
     report("decimating", 1.0)
     return ModelParts(
         name=training.name,
@@ -88,7 +88,7 @@ def finish(
     )
 
 
-def levels_of(
+def decimate_levels(
     mean: Float[np.ndarray, "V0 3"],
     faces: Int[np.ndarray, "F 3"],
     region: Bool[np.ndarray, " V0"],

@@ -21,7 +21,7 @@ from pipeline.results.head_files import ENCODINGS, encoded
 from pipeline.results.reconstruction import Reconstruction, ply_comments
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
 from rig.files import write_atomically
-from rig.formats.meshes.polygon_obj import MATERIAL, PolygonMesh, fan, polygon_obj_bytes
+from rig.formats.meshes.polygon_obj import MATERIAL, PolygonMesh, polygon_obj_bytes, triangulate_fan
 from rig.mesh import vertex_normals
 
 MAX_TILES = 10  # a row of UDIM
@@ -65,7 +65,7 @@ def template_textures(
         return {}
     places = _places(atlas.layout, surface_binding)
     of_polygon = np.repeat(np.arange(len(mesh.sizes)), mesh.sizes - 2)
-    rows = fan(mesh.sizes)
+    rows = triangulate_fan(mesh.sizes)
     spread = np.ptp(places[mesh.corners[rows]], axis=1).max(axis=1)
     whole = on_skin[of_polygon] & (spread < CUT)
     out = {}

@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from pipeline.applications.moments import arrow, joint_fit
 from pipeline.applications.moments.joint_fit import fit_jointly
-from pipeline.applications.moments.take import differ_by, solution_of
+from pipeline.applications.moments.take import measure_difference, solution_of
 from pipeline.contour_fit.contour import ContourSolution
 from pipeline.contour_fit.expression_evidence import LIDS
 from pipeline.head_model.model import HeadModel
@@ -115,7 +115,7 @@ def take_row(model: HeadModel, number: int, cameras: int, count: int, settings: 
     }
     row: Row = {f"{who}_{name}": float(value) for who, of in found.items() for name, value in of.items()}
     row["apart"] = [
-        differ_by(head.fit, other, settings.fitting.modes) for head, other in zip(fitted, joint, strict=True)
+        measure_difference(head.fit, other, settings.fitting.modes) for head, other in zip(fitted, joint, strict=True)
     ]
     row["weights"] = {
         "true": [[each.get(name, 0.0) for name in model.expressions.names] for each in drawn],

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 
 from pipeline.contour_fit.contour import schedule
 from pipeline.contour_fit.fit import Fit
-from pipeline.contour_fit.head_problem import head_problem
+from pipeline.contour_fit.head_problem import build_head_problem
 from pipeline.contour_fit.posterior import vertex_deviation_mm
 from pipeline.contour_fit.problem import PER_CAMERA, POSE, State, first_evidence, make_problem
 from pipeline.head_model.model import HeadModel, with_modes
@@ -105,7 +105,7 @@ def bound_mm(model: HeadModel, subject: Planted, clean: dict[str, Silhouette], r
     stage = replace(schedule(settings, len(model.modes))[-1], whole_head=True)
     problem = make_problem(model, subject.world_from_head, clean, rig, settings, {})
     state = State(subject.coefficients, subject.world_from_head, np.zeros((len(rig), PER_CAMERA)))
-    whole = head_problem(problem, first_evidence(settings), stage, UNROBUST_PX)
+    whole = build_head_problem(problem, first_evidence(settings), stage, UNROBUST_PX)
     matrix = whole.equations(whole.at(state)).matrix
     kept = stage.modes + POSE
     fit = Fit("bound", subject.coefficients, subject.world_from_head, 0, "", np.linalg.inv(matrix)[:kept, :kept])

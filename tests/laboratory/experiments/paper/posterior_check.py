@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.contour_fit.contour import run_stage
-from pipeline.contour_fit.head_problem import apply_step, head_problem, started_problem
+from pipeline.contour_fit.head_problem import apply_step, build_head_problem, started_problem
 from pipeline.contour_fit.problem import PER_CAMERA, POSE, ContourProblem, Stage, State, first_evidence, make_problem
 from pipeline.head_model.model import HeadModel, with_modes
 from rig.render.renderer import Renderer
@@ -62,7 +62,7 @@ def _row(model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, numbe
     state = State(np.zeros(0), subject.start, np.zeros((len(rig), PER_CAMERA)))
     evidence = first_evidence(problem.settings)
     mode, _, _ = run_stage(problem, evidence, state, stage, lambda fraction: None)
-    whole = head_problem(problem, evidence, stage, UNROBUST_PX)
+    whole = build_head_problem(problem, evidence, stage, UNROBUST_PX)
     covariance = np.linalg.inv(whole.equations(whole.at(mode)).matrix)
     chain = run_chain(problem, mode, stage, covariance, rng)
     found, laplace = np.cov(chain.draws.T), covariance

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.contour_fit.head_problem import head_problem
+from pipeline.contour_fit.head_problem import build_head_problem
 from pipeline.contour_fit.prior_term import SCALE_SPREAD
 from pipeline.contour_fit.problem import PER_CAMERA, POSE, Stage, State, first_evidence, make_problem
 from pipeline.head_model.model import HeadModel, with_modes
@@ -119,7 +119,7 @@ def information(model: HeadModel, head: Planted, rig: Rig) -> Information:
         flat = np.zeros((k.height, k.width), np.float32)  # no residual: the head is where the contour is
         seen = {camera.name: Silhouette(flat < 0, flat)}
         problem = make_problem(model, pose, seen, Rig((camera,)), settings, {}, levels=(stage.level,))
-        whole = head_problem(problem, first_evidence(settings), stage, UNROBUST_PX)
+        whole = build_head_problem(problem, first_evidence(settings), stage, UNROBUST_PX)
         matrix = whole.equations(whole.at(state)).matrix
         found.append(matrix - prior(model))
     return np.stack(found)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from pipeline.applications.templates import animated, carrying, contact, likeness, placement, registration
 from pipeline.applications.templates.animated import Neutral, carried_shapes, parted_shapes
-from pipeline.applications.templates.contact import WEIGHTS, RestSurface, crossings, rest_surface
+from pipeline.applications.templates.contact import WEIGHTS, RestSurface, crossings, prepare_rest_surface
 from pipeline.applications.templates.registration import register
 from pipeline.evidence.expression import build_blendshape_rig
 from pipeline.head_model.model import HeadModel
@@ -88,7 +88,7 @@ def _case(model: HeadModel, mesh: ForeignMesh, of_another: bool) -> Row:
     landmarks = {name: mean[row] for name, row in model.landmarks.items()}
     rest = binding.on(mean, faces)
     carried = carried_shapes(binding, triangles, Neutral(mean, faces, rest), moves, landmarks)
-    surface = rest_surface(rest, triangles)
+    surface = prepare_rest_surface(rest, triangles)
     parted = parted_shapes(surface, carried)
     true = {name: mesh.operator @ shape for name, shape in moves.items()}
     before, after = _errors(carried, true), _errors(parted, true)

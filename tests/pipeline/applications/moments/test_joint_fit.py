@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.applications.moments.joint_fit import fit_jointly, identity_of, joint_covariances, joint_problem
-from pipeline.applications.moments.take import OTHER_PERSON, differ_by
+from pipeline.applications.moments.joint_fit import build_joint_problem, fit_jointly, identity_of, joint_covariances
+from pipeline.applications.moments.take import OTHER_PERSON, measure_difference
 from pipeline.contour_fit.contour import ContourSolution, finish, last_problem, solve_contour
 from pipeline.contour_fit.prior_term import LOG_SCALE, SCALE_SPREAD
 from pipeline.contour_fit.problem import POSE
@@ -85,7 +85,7 @@ def test_moments_share_one_identity_that_is_nearer_than_their_own(alone, joint, 
 def test_the_prior_of_what_is_shared_counts_by_what_is_common(alone, common: float) -> None:
     """Two copies of one moment: twice its evidence, and the prior once if nothing is common."""
     twice = (alone[1], alone[1])
-    problem, layout = joint_problem(twice, common)
+    problem, layout = build_joint_problem(twice, common)
     here, off = problem.at(tuple(each.state for each in twice)), 1.0 - common
     found, (single, there) = problem.equations(here), last_problem(alone[1])
     alone_equations, shared = single.equations(there), layout.identity
@@ -118,7 +118,7 @@ def test_another_person_is_told_from_the_others(alone, wide, renderer) -> None:
     stranger = photographed(wide, SPREAD * np.random.default_rng(8).standard_normal(EIGENHEADS), {}, 9, renderer)
     among = (*alone[:3], stranger)
     found = [
-        differ_by(finish(one), other, EIGENHEADS)
+        measure_difference(finish(one), other, EIGENHEADS)
         for one, other in zip(among, fit_jointly(among, EIGENHEADS), strict=True)
     ]
     assert found[3] > OTHER_PERSON

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from pipeline.applications.templates.animated import PRESS_MM, Neutral, carried_shapes, parted_shapes, shut_lips
 from pipeline.applications.templates.carrying import SurfaceBinding, bind_vertices, surface_binding
-from pipeline.applications.templates.contact import WEIGHTS, crossing_vertices, rest_surface
+from pipeline.applications.templates.contact import WEIGHTS, crossing_vertices, prepare_rest_surface
 from pipeline.applications.templates.eyeballs import AHEAD, Eyeball
 from pipeline.applications.templates.write.writers import (
     SIZE_PX,
@@ -35,7 +35,7 @@ NAMES = ("jawOpen", "eyeBlinkLeft", "mouthUpperUpLeft", "mouthFunnel")
 
 def test_a_mouth_closes_after_it_has_opened_and_speaks_without_crossing() -> None:
     vertices, faces = sheets(gap_mm=0.3)
-    rest, upper = rest_surface(vertices, faces), np.arange(len(vertices)) >= len(vertices) // 2
+    rest, upper = prepare_rest_surface(vertices, faces), np.arange(len(vertices)) >= len(vertices) // 2
     opening = np.where(upper, 0.0, -8.0)[:, None] * (0.0, 0.0, 1.0)
     closing = -opening + dent(vertices, 1.5)
     shapes = {"jawOpen": opening, "mouthClose": closing, "mouthFunnel": dent(vertices, 2.0)}

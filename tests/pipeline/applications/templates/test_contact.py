@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.applications.templates.contact import WEIGHTS, crossing_vertices, keep_apart, rest_surface
+from pipeline.applications.templates.contact import WEIGHTS, crossing_vertices, keep_apart, prepare_rest_surface
 from rig.studio.scene.anatomy import grid_faces
 
 SIDE, EVERY = 21, tuple(k / 8 for k in range(1, 9))
@@ -30,7 +30,7 @@ def dent(vertices: np.ndarray, depth_mm: float) -> np.ndarray:
 
 def test_lips_that_touch_move_together_and_do_not_cross() -> None:
     vertices, faces = sheets(gap_mm=0.3)
-    rest, pressed = rest_surface(vertices, faces), dent(vertices, 4.0)
+    rest, pressed = prepare_rest_surface(vertices, faces), dent(vertices, 4.0)
     assert all(crossing_vertices(rest, pressed, (weight,)).any() for weight in WEIGHTS)
     found = keep_apart(rest, pressed, closing=False)
     assert not crossing_vertices(rest, found, EVERY).any()
@@ -41,7 +41,7 @@ def test_lips_that_touch_move_together_and_do_not_cross() -> None:
 
 def test_lids_stop_where_they_meet_and_what_crosses_nothing_stays() -> None:
     vertices, faces = sheets(gap_mm=9.0)
-    rest, closing = rest_surface(vertices, faces), dent(vertices, 9.6)
+    rest, closing = prepare_rest_surface(vertices, faces), dent(vertices, 9.6)
     assert not crossing_vertices(rest, closing, WEIGHTS[:3]).any()
     found = keep_apart(rest, closing, closing=True)
     assert not crossing_vertices(rest, found, EVERY).any()
@@ -49,13 +49,13 @@ def test_lids_stop_where_they_meet_and_what_crosses_nothing_stays() -> None:
     still = np.linalg.norm(vertices[:, :2] - 10.0, axis=1) > 8.0
     np.testing.assert_array_equal(found[still], closing[still])
     opening = -dent(vertices, 5.0)
-    assert keep_apart(rest_surface(vertices, faces), opening, closing=True) is opening
+    assert keep_apart(prepare_rest_surface(vertices, faces), opening, closing=True) is opening
 
 
 def test_what_crosses_at_rest_is_not_asked_of_a_shape() -> None:
     vertices, faces = sheets(gap_mm=1.0)
     vertices = vertices + dent(vertices, 2.0)
-    rest = rest_surface(vertices, faces)
+    rest = prepare_rest_surface(vertices, faces)
     assert rest.excluded.any()
     assert not rest.excluded.all()
     assert not crossing_vertices(rest, np.zeros_like(vertices), WEIGHTS).any()
@@ -65,6 +65,6 @@ def test_what_crosses_at_rest_is_not_asked_of_a_shape() -> None:
 def test_a_shape_is_changed_no_more_than_near_what_crosses(closing: bool) -> None:
     vertices, faces = sheets(gap_mm=5.0)
     wanted = dent(vertices, 5.5) + (0.5, 0.0, 0.0)
-    found = keep_apart(rest_surface(vertices, faces), wanted, closing=closing)
+    found = keep_apart(prepare_rest_surface(vertices, faces), wanted, closing=closing)
     corner = np.linalg.norm(vertices[:, :2] - (20.0, 20.0), axis=1) < 2.0
     np.testing.assert_allclose(found[corner], wanted[corner], atol=1e-9)

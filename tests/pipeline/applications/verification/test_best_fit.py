@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.applications.verification.best_fit import best_fit
+from pipeline.applications.verification.best_fit import align_face
 from pipeline.applications.verification.reference import Reference
 from rig.errors import InputError
 from rig.geometry import RigidTransform, rotation_from_vector
@@ -22,7 +22,7 @@ def elsewhere(scale: float = 1.0) -> Mesh:
 
 def test_landmarks_start_it_and_the_surface_ends_it() -> None:
     off = {name: SOMEWHERE.apply(point) + 2.0 for name, point in marks().items()}  # marked 3.5 mm aside
-    fit = best_fit(measured_head(), Reference.of(elsewhere(), off))
+    fit = align_face(measured_head(), Reference.of(elsewhere(), off))
     truth = SOMEWHERE @ WORLD_FROM_HEAD.inverse()
     assert fit.start == "landmarks"
     assert fit.rms_mm < 1e-3
@@ -37,7 +37,7 @@ def test_a_search_finds_it_without_landmarks_on_a_pedestal() -> None:
     stand = replace(stand, vertices=0.9 * (stand.vertices - stand.vertices.mean(axis=0)) + (0.0, -240.0, 0.0))
     whole = np.concatenate([mannequin().vertices, stand.vertices])
     faces = np.concatenate([mannequin().faces, stand.faces + len(mannequin().vertices)])
-    fit = best_fit(measured_head(), Reference.of(Mesh(SOMEWHERE.apply(whole), faces), {}))
+    fit = align_face(measured_head(), Reference.of(Mesh(SOMEWHERE.apply(whole), faces), {}))
     assert fit.start == "search"
     assert fit.rms_mm < 1e-3
 
@@ -45,7 +45,7 @@ def test_a_search_finds_it_without_landmarks_on_a_pedestal() -> None:
 def test_a_size_is_reported_and_takes_no_part() -> None:
     """The reference is 1 % larger: the head is 1 / 1.01 of it, and what no motion takes away is left."""
     larger = {name: SOMEWHERE.apply(1.01 * point) for name, point in marks().items()}
-    fit = best_fit(measured_head(), Reference.of(elsewhere(1.01), larger))
+    fit = align_face(measured_head(), Reference.of(elsewhere(1.01), larger))
     assert fit.scale == pytest.approx(1 / 1.01, abs=3e-5)
     assert 0.2 < fit.rms_mm < 1.0
 
@@ -55,4 +55,4 @@ def test_another_object_is_refused() -> None:
     poles = ball.vertices[np.argsort(ball.vertices[:, 1])[[0, 600, 1200]]]
     named: dict[str, np.ndarray] = dict(zip(["gnathion", "pronasale", "glabella"], poles, strict=True))
     with pytest.raises(InputError, match=r"ball\.ply: is no scan of the head in shot"):
-        best_fit(measured_head(), Reference.of(ball, named, "ball.ply"))
+        align_face(measured_head(), Reference.of(ball, named, "ball.ply"))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.segmentation.without_plates.viewing_volume import ask_other_views, reachable, viewing_ball, viewing_volume
+from pipeline.segmentation.without_plates.viewing_volume import ask_other_views, build_volume, reachable, viewing_ball
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 from rig.rig import Rig
@@ -39,7 +39,7 @@ def test_the_ball_reaches_the_images_corners() -> None:
 
 def test_other_views_hold_the_ball_and_deny_what_is_beside_it() -> None:
     rig = ring()
-    volume = viewing_volume(rig, dict.fromkeys(rig.names, SIZE), viewing_ball(rig))
+    volume = build_volume(rig, dict.fromkeys(rig.names, SIZE), viewing_ball(rig))
     odds = {c.name: np.where(from_ball(c, RADIUS_MM) < 0, 5.0, -5.0).astype(np.float32) for c in rig}
     odds["c0"][:] = -5.0  # this view is blind, and asks
     others = ask_other_views(volume, odds)["c0"]
@@ -55,7 +55,7 @@ def test_other_views_hold_the_ball_and_deny_what_is_beside_it() -> None:
 def test_nothing_is_left_beyond_the_plane() -> None:
     rig = ring()
     plane = np.array([0.0, 1.0, 0.0, 0.0])  # what is above y = 0 stays
-    volume = viewing_volume(rig, dict.fromkeys(rig.names, SIZE), viewing_ball(rig), plane_world=plane)
+    volume = build_volume(rig, dict.fromkeys(rig.names, SIZE), viewing_ball(rig), plane_world=plane)
     level = [camera for camera in rig if abs(camera.centre_world[1]) < 70]
     assert level
     for camera in level:

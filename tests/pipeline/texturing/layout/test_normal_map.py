@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.texturing.layout.normal_map import ReducedLayout, normal_mapped, reduce, vertex_tangents
+from pipeline.texturing.layout.normal_map import ReducedLayout, map_normals, reduce, vertex_tangents
 from pipeline.texturing.layout.uv_unwrap import Layout, unwrap
 from rig.formats.meshes.scene import Skin
 from rig.formats.pictures.images import encode_image
@@ -72,7 +72,7 @@ def opened(glb: bytes) -> tuple[dict[str, np.ndarray], np.ndarray]:
 
 
 def written(ball: Ball, size: int = 1024) -> bytes:
-    mapped = normal_mapped(ball.mesh.vertices, true_normals(ball.unit), ball.layout, ball.reduced, size)
+    mapped = map_normals(ball.mesh.vertices, true_normals(ball.unit), ball.layout, ball.reduced, size)
     blank = encode_image(".png", np.full((8, 8, 3), 200, np.uint8))
     skin = Skin(mapped.uv, blank, "image/png", normal_map=encode_image(".png", mapped.image), tangents=mapped.tangents)
     return glb_bytes(mapped.mesh, normals=mapped.normals, skin=skin)

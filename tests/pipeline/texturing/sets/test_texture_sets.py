@@ -12,7 +12,7 @@ from pipeline.settings import TextureSettings
 from pipeline.texturing.layout.uv_unwrap import Atlas, ModelLayout, unwrap
 from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from pipeline.texturing.paint import paint_texture
-from pipeline.texturing.sets.specular import exposure_ratios
+from pipeline.texturing.sets.specular import measure_exposures
 from pipeline.texturing.sets.texture_sets import SetTextures, colour_by_sets
 from pipeline.texturing.vertex_colours import colour_vertices
 from pipeline.texturing.visibility import Decision
@@ -145,7 +145,7 @@ def exposed(images: Mapping[str, ImageRgb], share: float) -> dict[str, ImageRgb]
 
 def test_another_exposure_of_the_parallel_pictures_is_found_and_taken_out(shiny: Coloured, found: SetTextures) -> None:
     sets = shiny.capture.texture_sets
-    ratios = exposure_ratios(
+    ratios = measure_exposures(
         sets["cross"], exposed(sets["parallel"], 0.6), shiny.silhouettes, shiny.decision.views.names
     )
     assert list(ratios.values()) == pytest.approx([0.6] * 5, rel=0.02)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pipeline.applications.model_building.correspondence.correspondence import CylinderIndex, coordinates, points_at
 from pipeline.applications.model_building.correspondence.scans import find_scans, plain_name, read_landmarks
 from pipeline.applications.model_building.training.figures import Scanner, scan_head
-from pipeline.geometry.registration.nonrigid import landmark_warp
+from pipeline.geometry.registration.nonrigid import warp_by_landmarks
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.landmarks import NAMES
 from pipeline.head_model.model import load_model
@@ -60,10 +60,10 @@ def test_warp_meets_landmarks_and_keeps_affine_motions() -> None:
     rng = np.random.default_rng(2)
     source, points = rng.normal(0, 50, (26, 3)), rng.normal(0, 80, (200, 3))
     target = source + rng.normal(0, 5, (26, 3))
-    np.testing.assert_allclose(landmark_warp(source, target, source), target, atol=1e-6)
+    np.testing.assert_allclose(warp_by_landmarks(source, target, source), target, atol=1e-6)
     matrix, shift = np.eye(3) + rng.normal(0, 0.1, (3, 3)), rng.normal(0, 10, 3)
     np.testing.assert_allclose(
-        landmark_warp(source, source @ matrix + shift, points, smoothing=3.0), points @ matrix + shift, atol=1e-6
+        warp_by_landmarks(source, source @ matrix + shift, points, smoothing=3.0), points @ matrix + shift, atol=1e-6
     )
 
 
