@@ -9,14 +9,13 @@ MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
 def test_mirror_images_are_each_others_in_shape_normals_and_bias() -> None:
-    pairs = point_table().mirror_images
+    table, direction = point_table(), np.array([0.5, 0.3, np.sqrt(1 - 0.34)])
+    pairs = table.mirror_images
     assert (pairs[pairs] == np.arange(468)).all()
     assert (pairs[[33, 133, 61, 1, 10, 152]] == [263, 362, 291, 1, 10, 152]).all()
-    table, direction = point_table(), np.array([0.5, 0.3, np.sqrt(1 - 0.34)])
-    mirrored = table.mirror_images
-    np.testing.assert_allclose(table.shape_mm, table.shape_mm[mirrored] * MIRROR, atol=1e-4)
-    np.testing.assert_allclose(table.normals, table.normals[mirrored] * MIRROR, atol=1e-4)
-    np.testing.assert_allclose(view_bias(direction), view_bias(direction * MIRROR)[mirrored] * (-1.0, 1.0), atol=2e-3)
+    np.testing.assert_allclose(table.shape_mm, table.shape_mm[pairs] * MIRROR, atol=1e-4)
+    np.testing.assert_allclose(table.normals, table.normals[pairs] * MIRROR, atol=1e-4)
+    np.testing.assert_allclose(view_bias(direction), view_bias(direction * MIRROR)[pairs] * (-1.0, 1.0), atol=2e-3)
     np.testing.assert_allclose(view_terms(direction * MIRROR), view_terms(direction) * view_terms(MIRROR))
 
 
