@@ -24,6 +24,7 @@ SURE_MM = 0.5  # no guess is better
 # About an ear within which the head says where it ends. And how far it may stand out of its outlines, which would cut a
 # thin rim to shreds.
 EAR_MM, EAR_SPARED_MM = 15.0, 10.0
+LEAST_COSINE = 0.1  # between a ray and a head's surface: a cone nine radii off says nothing
 CANDIDATES = 8  # of the head's triangles, for the one nearest to a place
 
 
@@ -38,7 +39,11 @@ class SeenSurface:
 
 
 def distance_to_subject(
-    places: Float[np.ndarray, "n 3"], hull_mm: Float[np.ndarray, " n"], head_world: Mesh, seen: SeenSurface
+    places: Float[np.ndarray, "n 3"],
+    hull_mm: Float[np.ndarray, " n"],
+    head_world: Mesh,
+    seen: SeenSurface,
+    cameras: Float[np.ndarray, "k 3"],
 ) -> Float[np.ndarray, " n"]:
     """Returns the signed distance (mm, positive outside) of points to the predicted surface; -inf near the open border
     of the head.
@@ -48,10 +53,14 @@ def distance_to_subject(
         hull_mm: their signed distances to the visual hull.
         head_world: the fitted head.
         seen: points of the seen surface, from which the offsets of head and hull are extrapolated.
+        cameras: the centres of the cameras, world frame, mm.
     """
     vertices, normals = head_world.vertices[::EVERY], head_world.normals()[::EVERY]
     tree = PointTree.of(vertices)
-    (thickness, gap), (head_square, hull_square) = _offsets(tree, normals, seen)
+    excess_mm = hull_excess_mm(vertices, normals, cameras)
+    (thickness, gap), (head_square, hull_square) = _offsets(tree, normals, seen, excess_mm)
+    gap += excess_mm
+    hull_square += excess_mm**2
     far, near = nearest(tree, places)
     height = ((places - vertices[near]) * normals[near]).sum(axis=1)
     by_head, by_hull = np.copysign(far, height) - thickness[near], hull_mm + gap[near]
@@ -59,8 +68,19 @@ def distance_to_subject(
     return np.where(near_rim(head_world, vertices)[near], -np.inf, share * by_head + (1.0 - share) * by_hull)
 
 
+def hull_excess_mm(
+    vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"], cameras: Float[np.ndarray, "k 3"]
+) -> Float[np.ndarray, " v"]:
+    """Returns how far (mm) the visual hull lies outside a head at its vertices. A camera's cone touches the head where
+    the camera's ray is tangential; a ball of the same radius tells how far the cone is off elsewhere."""
+    rays = vertices[:, None] - cameras
+    sines = np.abs((rays * normals[:, None]).sum(axis=2)) / np.linalg.norm(rays, axis=2)
+    cosine = np.sqrt(np.maximum(1.0 - sines.min(axis=1) ** 2, LEAST_COSINE**2))
+    return np.linalg.norm(vertices - vertices.mean(axis=0), axis=1) * (1.0 / cosine - 1.0)
+
+
 def _offsets(
-    tree: PointTree, normals: Float[np.ndarray, "v 3"], seen: SeenSurface
+    tree: PointTree, normals: Float[np.ndarray, "v 3"], seen: SeenSurface, excess_mm: Float[np.ndarray, " v"]
 ) -> tuple[Float[np.ndarray, "2 v"], Float[np.ndarray, "2 v"]]:
     """Returns the offsets (mm) of the seen surface from the head and from the hull around each vertex of the head, and
     their mean squares (mm^2). The offsets are extrapolated from vertices near seen points by inverse squared distances.
@@ -70,16 +90,20 @@ def _offsets(
     within = np.isfinite(far)
     near, weight = near[within], seen.weight[within]
     height = np.maximum(((seen.points[within] - vertices[near]) * normals[near]).sum(axis=1), 0.0)
-    depth = np.maximum(-seen.hull_mm[within], 0.0)
+    depth = np.maximum(-seen.hull_mm[within], 0.0) - excess_mm[near]
     known = np.flatnonzero(np.bincount(near, minlength=len(vertices)) >= MIN_POINTS)
     if len(known) < NEAREST:
         return np.zeros((2, len(vertices))), np.tile([[0.0], [1.0]], len(vertices))
-    total = np.bincount(near, weight, len(vertices))[known]
-    mean_mm = np.stack([np.bincount(near, weight * each, len(vertices))[known] / total for each in (height, depth)])
-    far, near = nearest(PointTree.of(vertices[known]), vertices, count=NEAREST)
-    share = total[near] / (far * far + EVEN_MM**2)
-    share /= share.sum(axis=1, keepdims=True)
-    return (share * mean_mm[:, near]).sum(axis=2), (share * mean_mm[:, near] ** 2).sum(axis=2) + SURE_MM**2
+    far, among = nearest(PointTree.of(vertices[known]), vertices, count=NEAREST)
+    means, squares = np.empty((2, len(vertices))), np.empty((2, len(vertices)))
+    for row, (off_mm, sure) in enumerate([(height, weight), (depth, weight / (excess_mm[near] + EVEN_MM) ** 2)]):
+        total = np.bincount(near, sure, len(vertices))[known]
+        mean_mm = np.bincount(near, sure * off_mm, len(vertices))[known] / total
+        share = total[among] / (far * far + EVEN_MM**2)
+        share /= share.sum(axis=1, keepdims=True)
+        means[row] = (share * mean_mm[among]).sum(axis=1)
+        squares[row] = (share * mean_mm[among] ** 2).sum(axis=1) + SURE_MM**2
+    return means, squares
 
 
 def distance_about_ears(

@@ -245,7 +245,7 @@ def solve(
     hull_mm, cut = at_points(grid, votes.bound, known), find_cut(grid, views, known, head_world)
     votes = add_bust_end(votes, grid, cut)
     weight = np.where(agreed[::THINNED] < VIEWS_SURE, ALONE_FACTOR**-2, 1.0)
-    guess = _prior(grid, votes, head_world, SeenSurface(known, hull_mm, weight), cut)
+    guess = _prior(grid, votes, head_world, SeenSurface(known, hull_mm, weight), views, cut)
     if hair is not None:
         shell, outside = distance_to_shell(hair, views, grid)  # of hair, where photographs show its outside
         mixed = outside * np.maximum(shell, votes.bound) + (1.0 - outside) * guess
@@ -300,7 +300,7 @@ def _box(
     return low, high - low
 
 
-def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface, cut: Cut) -> Field:
+def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface, views: ViewStack, cut: Cut) -> Field:
     """Returns the signed distance from which the relaxation starts. The start value is the measured distance where
     views certainly see the surface, and elsewhere the distance to the surface predicted from visual hull and head."""
     prior = np.maximum(votes.value, votes.bound).astype(float)
@@ -309,7 +309,7 @@ def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface,
         guessed = weak | ((votes.weight <= 0) & (prior < 0))
         hull = np.where(weak, votes.bound, prior)[guessed]
         places = grid.places(guessed)
-        guess = distance_to_subject(places, hull, head_world, seen)
+        guess = distance_to_subject(places, hull, head_world, seen, views.cameras[:, CENTRE:])
         if cut.before_mm is not None:
             guess = np.maximum(guess, np.where(weak[guessed], -np.inf, cut.before_mm[guessed]))
         prior[guessed] = np.where(weak[guessed] & np.isneginf(guess), prior[guessed], np.maximum(hull, guess))
