@@ -91,15 +91,6 @@ class LinearisedCornerTerm:
         rows /= self.noise_px[:, None, None]
         return rows
 
-    def jacobian(self, size: int) -> Float[np.ndarray, "n 2 q"]:
-        """Returns the dense Jacobian of all corners by all ``size`` parameters, which tests and other solvers use."""
-        observed, rows = self.term.seen, self.by_view()
-        whole = np.zeros((*rows.shape[:2], size))
-        for view, at in enumerate(places(observed, len(self.state.intrinsics), size)):
-            of_view = slice(observed.starts[view], observed.starts[view + 1])
-            whole[of_view, :, at] = rows[of_view]
-        return whole
-
 
 def places(observed: Observations, cameras: int, size: int) -> Int[np.ndarray, "v 22"]:
     """Returns, for each view, the indices of its 22 parameters: camera (15), board (6) and time offset (1)."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.adjustment.bundle import HUBER, BundleSolution, CornerTerm, Free, build_bundle_problem
+from calibration.adjustment.bundle import HUBER, BundleSolution, CornerTerm, Free, build_bundle_problem, places
 from calibration.adjustment.gauge import align_world, gauge_projection, image_distance, image_sigma, world_motions
 from calibration.adjustment.lens_prior import LensPrior, weak_prior
 from calibration.adjustment.state import PER_CAMERA, PER_SHOT, Observations, observe_views, residuals
@@ -34,12 +34,12 @@ def test_views_add_their_blocks_to_the_normal_equations() -> None:
     state, seen = planted(source), seen_in(source)
     state = replace(state, velocities=np.random.default_rng(0).normal(size=state.velocities.shape))
     here = CornerTerm(seen, np.full(3, 0.1), HUBER).at(state)
-    size = 3 * PER_CAMERA + 5 * PER_SHOT + 3
-    equations = NormalEquations.empty(size)
+    equations = NormalEquations.empty(3 * PER_CAMERA + 5 * PER_SHOT + 3)
     here.add_to(equations)
     weight = HUBER.weight((here.residual**2).sum(axis=1))
     assert weight.min() < 0.9
-    rows = here.jacobian(size)
+    rows = np.zeros((*here.residual.shape, len(equations.gradient)))
+    np.put_along_axis(rows, places(seen, 3, rows.shape[2])[seen.view_of][:, None], here.by_view(), axis=2)
     expected = np.einsum("n,nap,naq->pq", weight, rows, rows)
     scale = np.sqrt(np.diag(expected) + 1e-12)
     np.testing.assert_allclose(equations.matrix / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-12)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibration.adjustment.bundle import CornerTerm
+from calibration.adjustment.bundle import CornerTerm, places
 from calibration.adjustment.lens_prior import AspectTerm
 from calibration.adjustment.state import PER_CAMERA as PER_BUNDLE_CAMERA
 from calibration.adjustment.state import PER_SHOT, BundleState, Observations, moved_state, observe_views
@@ -80,9 +80,8 @@ def tangency(focal: bool) -> Case:
 
 def small_bundle() -> tuple[BundleState, Observations]:
     """Three cameras, five shots, the board in motion, some corners off."""
-    source, rng = session(cameras=3, shots=5, seed=1), np.random.default_rng(0)
-    d, velocities = source.detections, rng.normal(size=(5, 6)) * [0.01, 0.01, 0.01, 10, 10, 10]
-    state = replace(planted(source), velocities=velocities)
+    source, velocities = session(cameras=3, shots=5, seed=1), np.random.default_rng(0).normal(size=(5, 6))
+    d, state = source.detections, replace(planted(source), velocities=velocities * [0.01, 0.01, 0.01, 10, 10, 10])
     return state, observe_views(d.views, source.rig.names, d.shots, d.board)
 
 
@@ -91,8 +90,9 @@ def corners() -> Case:
     term = CornerTerm(seen, np.full(3, 0.2))
     per_camera = [*[1e-2] * 4, *[1e-4] * 5, *[1e-5] * 3, *[1e-2] * 3]
     steps = np.array([*per_camera * 3, *[*[1e-5] * 3, *[1e-2] * 3] * 5, *[1e-4] * 3])
-    here = term.at(state)
-    jacobian = here.jacobian(len(steps)).reshape(here.residual.size, -1)
+    jacobian = np.zeros((2 * len(seen.pixels), len(steps)))
+    rows, at = jacobian.reshape(-1, 2, len(steps)), places(seen, 3, len(steps))[seen.view_of]
+    np.put_along_axis(rows, at[:, None], term.at(state).by_view(), axis=2)
     return Case(lambda step: term.at(moved_state(state, step)).residual.ravel(), jacobian, steps, 1e-5)
 
 
