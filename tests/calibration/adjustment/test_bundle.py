@@ -38,8 +38,8 @@ def test_views_add_their_blocks_to_the_normal_equations() -> None:
     here.add_to(equations)
     weight = HUBER.weight((here.residual**2).sum(axis=1))
     assert weight.min() < 0.9
-    rows = np.zeros((*here.residual.shape, len(equations.gradient)))
-    np.put_along_axis(rows, places(seen, 3, rows.shape[2])[seen.view_of][:, None], here.by_view(), axis=2)
+    rows = np.zeros((len(seen.pixels), 2, len(equations.gradient)))
+    np.put_along_axis(rows, places(seen, 3, len(equations.gradient))[seen.view_of][:, None], here.by_view(), axis=2)
     expected = np.einsum("n,nap,naq->pq", weight, rows, rows)
     scale = np.sqrt(np.diag(expected) + 1e-12)
     np.testing.assert_allclose(equations.matrix / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-12)
