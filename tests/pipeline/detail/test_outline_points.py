@@ -55,7 +55,7 @@ def off_tip_mm(outlines: OutlineSearch | None) -> float:
         nodes,
         points(),
         loose=np.zeros(len(vertices), bool),
-        outlines=outlines and outlines.observed,
+        outlines=outlines and outlines.observe,
     )
     return float(np.linalg.norm(found.vertices[(vertices @ TIP).argmax()]) - TRUE_MM)
 
