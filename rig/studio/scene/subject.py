@@ -124,9 +124,9 @@ class Look:
     stubble: float = 0.0
     texture: bool = True
     beard: HairStyle | None = None
-    make_cap: Colour | None = None
+    cap: Colour | None = None
     tight_cap: TightCap | None = None
-    make_glasses: bool = False
+    glasses: bool = False
     pores: float = 1.0  # contrast, by the painted one
     oil: float = 0.0
     scattering_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
