@@ -24,6 +24,7 @@ import numpy as np
 
 from rig.files import write_atomically
 from rig.formats.meshes.mesh_file import read_mesh
+from rig.studio.devices.folder import simulate_to_folder
 from tests.laboratory.experiments.markdown import table
 from tests.support.services import free_port
 
@@ -122,9 +123,16 @@ def _made(case: Path, out: Path) -> tuple[dict[str, tuple[Path, Path | None]], d
             others[str(words[0]), name] = done.returncode == 0, f"{done.stderr} {done.stdout}".strip()
         return done
 
+    def simulated(folder: Path, *of: Any, features: bool = True, **named: Any) -> Path:
+        truth = simulate_to_folder(folder, *of, **named)
+        if not features:
+            (folder / "features.json").unlink()
+        return truth
+
     said, changed = io.StringIO(), {"check": noted, "upload": noted, "reconstruct": noted, "eigenhead": run}
     with (
         mock.patch.multiple(common, **changed),
+        mock.patch("rig.studio.devices.folder.simulate_to_folder", simulated),  # which the cases call
         mock.patch.object(sys, "argv", [str(case / "make.py"), str(out)]),
         contextlib.redirect_stdout(said),
         contextlib.suppress(FileNotFoundError),  # of results that no door made yet
