@@ -14,19 +14,7 @@ import typer
 
 from rig.errors import EigenheadError, InputError, how_to_install
 from rig.messages.message import compose
-from server.cli.answers import (
-    QUIET,
-    Anyway,
-    Data,
-    Json,
-    Strict,
-    answer,
-    fail,
-    prepare_folder,
-    terminated_like_interrupted,
-    warn,
-    wrong_usage,
-)
+from server.cli.answers import QUIET, Anyway, Data, Json, Strict, answer, fail, prepare_folder, warn, wrong_usage
 from server.cli.heads import Detail, Formats, Method, Model, Surface
 
 if TYPE_CHECKING:
@@ -135,7 +123,7 @@ def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "S
     folder, cores = BatchFolder(out), usable_cores()
     count = workers or worker_count(cores, free_memory(), len(share_tasks))
     files: list[Path] = []
-    with terminated_like_interrupted(), BatchDisplay.opened(count, share_tasks) as display:
+    with BatchDisplay.opened(count, share_tasks) as display:
         display.prepare(share_tasks)
         threads = os.environ.get(THREADS) or str(threads_of_worker(cores, count))  # the user's choice goes before ours
         run = BatchRun(folder, share_tasks, workers=count, variables={THREADS: threads}, observer=display, shard=share)

@@ -170,8 +170,7 @@ def reconstruct(
     warn_of_replacement(out / "report.json", overwrite)
     with progress_bar() as report:
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report, trace=trace)
-    for warning in written["warnings"]:
-        warn(f"{warning['code']}: {warning['message']}")
+    warn(*(f"{warning['code']}: {warning['message']}" for warning in written["warnings"]))
     names = ("contact_sheet.png", "head.ply", "bust.ply", f"head-{template}.obj")  # in the order of looking at them
     files = [out / name for name in names if (out / name).is_file()]
     answer(written, json_out, [*(str(path) for path in files), *flame_lines(written, out)])

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import tomllib
@@ -13,6 +14,7 @@ import typer
 
 from pipeline import settings
 from pipeline.settings import OutputSettings, Settings
+from rig.files import write_atomically
 from rig.formats.cameras.cameras_file import FORMATS, write_rig_file
 from rig.formats.cameras.dataset_json import DATASET_FORMATS
 from server.cli import answers
@@ -72,6 +74,20 @@ def test_quiet_leaves_errors_alone_and_a_log_gets_lines_of_progress(
     assert "of_nobody" in run(*command, str(tmp_path / "a.json")).stderr
     assert run(*command, str(tmp_path / "b.json"), "--quiet").stderr == ""
     assert run(*command, str(tmp_path / "no" / "\0"), "--quiet").returncode != 0
+
+
+def test_ctrl_c_leaves_one_line_on_what_was_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def stop(out: str, *files: str) -> None:
+        for file in files:
+            write_atomically(Path(out, file), b"")
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    out, again = str(tmp_path / "out"), "run the same command again to go on"
+    left = {"reconstruct": ((), "nothing was written"), "verify": (("a",), f"{out} is not complete")}
+    for name, (files, said) in {**left, "take": (("b",), again)}.items():
+        with pytest.raises(typer.Exit, match="130"):
+            answers.stoppable(lambda out, files=files: stop(out, *files), name)(out=out)
+        assert capsys.readouterr().err == f"eigenhead: Stopped; {said}\n"
 
 
 def test_a_failure_is_one_clear_line_and_status_1(tmp_path: Path) -> None:
