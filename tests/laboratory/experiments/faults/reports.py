@@ -35,7 +35,7 @@ SCALED = "known length|times as (large|small)|as large as|looks? like|cameras sh
 WANTED = {  # by CASE/INPUT, the longest that fits; any of these words; no words: read, and right
     "01-free-scale/x": SCALED, "01-free-scale/x1": "", "01-free-scale/x5": SCALED,
     "31-far-origin": "km from the world's origin", "05-four-to-seven-cameras": "", "08-inverted-masks": "invert",
-    "14-metashape-labels/slaves": "slave", "13-legacy-charuco/ratio-0.6": "times as wide as its squares",
+    "14-metashape-labels/slaves": "slave", "13-legacy-charuco/ratio-0.6": "times as wide as the squares",
     "19-machine-vision-pictures/mosaic": "mosaic", "19-machine-vision-pictures/twelve-bits": "12 bits",
     "23-unread-cameras-uploaded/camchain-yaml": "Kalibr", "23-unread-cameras-uploaded/calibration-json": "calib.io",
     "23-unread-cameras-uploaded/cameras-opk": "phi, kappa", "23-unread-cameras-uploaded/blocks-xml": "ContextCapture",
