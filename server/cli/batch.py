@@ -101,7 +101,7 @@ def _captures_in(captures: Path, out: Path) -> "tuple[BatchCapture, ...]":
     if captures.is_file() and is_archive(captures):
         raise InputError(captures.name, [compose("batch-folder-is-capture")])
     captures_found = find_captures(captures, out) if captures.is_dir() else read_list(captures)
-    out_folder = out.resolve()
+    out_folder = Path(os.path.realpath(out))  # which bears a link to itself
     faults = [
         compose("batch-out-within", out=str(out), capture=capture.name)
         for capture in captures_found

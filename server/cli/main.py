@@ -1,6 +1,7 @@
 """Implements the command ``eigenhead``. Each command imports heavy modules when it runs, so that ``--help`` answers at
 once."""
 
+import errno
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -109,6 +110,8 @@ def main() -> None:
     except Exception as error:
         if os.environ.get("EIGENHEAD_DEBUG"):
             raise
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            fail("the disk is full: make room, then run the same command again")
         if isinstance(error, OSError) and error.filename:
             fail(f"{error.filename} cannot be used ({error.strerror}): name another place, or mend who may use it")
         fail(f"{type(error).__name__}: {error} (EIGENHEAD_DEBUG=1 shows where)")

@@ -1,6 +1,7 @@
 """Implements ``eigenhead reconstruct``: reconstructs one capture in this process, without the service."""
 
 import json
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -81,7 +82,8 @@ def check_apart(out: Path, capture: Path, option: str = "--out") -> None:
 
     if not capture.is_dir():
         return
-    out_folder, whole, root = out.resolve(), capture.resolve(), capture_root(capture).resolve()
+    out_folder = Path(os.path.realpath(out))  # which bears a link to itself
+    whole, root = capture.resolve(), capture_root(capture).resolve()
     pictures = [root / kind for kind in ("images", *BESIDE_PICTURES, TEXTURE_SETS)]
     pictures += [picture_folder(root)] if photographs_alone(root) else []  # there every folder counts as a camera's
     # The root is recognised as the only folder within ``whole``: a result beside it would hide it.

@@ -87,7 +87,7 @@ TEMPLATES = {
     "picture-floats": "the picture holds floating-point numbers: save it in 8 or 16 bits",
     "pages-unread": "{pictures} holds several pictures, and the first is read | {pictures} hold several pictures each, and the first is read",
     "picture-scaled": "{fault}, with the same aspect ratio: use pictures of the calibrated size, or calibrate with this size",
-    "no-json": "the file cannot be read as JSON ({reason})",
+    "no-json": "the file cannot be read as JSON ({reason}): correct it there, or export it again",
     "features-no-points": "the file is no object with an object 'points'",
     "format-is": "the format is {format}; expected {wanted}",
     "features-by-camera": "the points are listed by camera; expected a list by landmark, with the cameras inside each landmark",

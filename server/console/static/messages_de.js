@@ -830,7 +830,7 @@ export default {
   "picture-floats": "enthält Gleitkommazahlen: in 8 oder 16 Bit speichern",
   "pages-unread": "{pictures} enthält mehrere Bilder, und das erste wird gelesen | {pictures} enthalten je mehrere Bilder, und das erste wird gelesen",
   "picture-scaled": "{fault}, und die Form ist dieselbe: in der kalibrierten Größe geben oder mit dieser kalibrieren",
-  "no-json": "lässt sich nicht als JSON lesen ({reason})",
+  "no-json": "lässt sich nicht als JSON lesen ({reason}): dort berichtigen, oder neu ausgeben",
   "features-no-points": "ist kein Objekt mit einem Objekt 'points'",
   "format-is": "format ist {format}, verlangt ist {wanted}",
   "features-by-camera": "die Punkte stehen nach Kameras: verlangt sind zuerst die Landmarken und in jeder ihre Kameras",

@@ -17,11 +17,10 @@ from pipeline.settings import OutputSettings, Settings
 from rig.files import write_atomically
 from rig.formats.cameras.cameras_file import FORMATS, write_rig_file
 from rig.formats.cameras.dataset_json import DATASET_FORMATS
-from server.cli import answers
+from server.cli import answers, main
 from server.cli.answers import service_settings
 from server.cli.cameras import CameraFormat
 from server.cli.export import ExportFormat
-from server.cli.main import ROOMS
 from tests.support import fork_server
 from tests.support.services import ROOT, small_capture
 from tests.support.small_captures import small_rig
@@ -49,7 +48,7 @@ def test_every_command_has_help_with_an_example(command: str) -> None:
 def test_commands_are_listed_in_rooms_and_choices_are_those_of_the_settings() -> None:
     shown = run("--help").stdout
     assert [line[:-1] for line in shown.splitlines() if line.endswith(":")][1:] == [
-        title for title, _ in ROOMS.values()
+        title for title, _ in main.ROOMS.values()
     ]
     shown = " ".join(run("reconstruct", "--help").stdout.split())
     for name, kind in (("method", Settings), ("detail", Settings), ("device", Settings), ("surface", OutputSettings)):
@@ -88,6 +87,13 @@ def test_ctrl_c_leaves_one_line_on_what_was_written(tmp_path: Path, capsys: pyte
         with pytest.raises(typer.Exit, match="130"):
             answers.stoppable(lambda out, files=files: stop(out, *files), name)(out=out)
         assert capsys.readouterr().err == f"eigenhead: Stopped; {said}\n"
+
+
+def test_a_full_disk_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(main, "app", lambda: Path("/dev/full").write_bytes(b"full"))
+    with pytest.raises(SystemExit, match="1"):
+        main.main()
+    assert capsys.readouterr().err == "eigenhead: the disk is full: make room, then run the same command again\n"
 
 
 def test_a_failure_is_one_clear_line_and_status_1(tmp_path: Path) -> None:
