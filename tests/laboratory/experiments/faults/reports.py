@@ -39,7 +39,7 @@ WANTED = {  # by CASE/INPUT, the longest that fits; any of these words; no words
     "19-machine-vision-pictures/mosaic": "mosaic", "19-machine-vision-pictures/twelve-bits": "12 bits",
     "23-unread-cameras-uploaded/camchain-yaml": "Kalibr", "23-unread-cameras-uploaded/calibration-json": "calib.io",
     "23-unread-cameras-uploaded/cameras-opk": "phi, kappa", "23-unread-cameras-uploaded/blocks-xml": "ContextCapture",
-    "26-one-camera-upside-down": "upside down", "28-compressed-glb": "Draco|quantised",
+    "26-one-camera-upside-down": "turned by 180 degrees", "28-compressed-glb": "Draco|quantised",
     "32-conventions/world-to-camera": "inverse", "32-conventions/opencv-axes": "negate",
     "32-conventions/centimetres": "centimetres", "32-conventions/quaternion-w-last": "real part",
 }  # fmt: skip
