@@ -1,7 +1,6 @@
 """Implements the command ``eigenhead``. Each command imports heavy modules when it runs, so that ``--help`` answers at
 once."""
 
-import errno
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -10,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup, TyperOption
 
-from rig.errors import EigenheadError
+from rig.errors import DISK_FULL, EigenheadError
 from server.cli import batch, cameras, clinic, export, heads, models, moments, rig, service, simulate, templates
 from server.cli.answers import QUIET, fail, stoppable, use_threads
 
@@ -110,7 +109,7 @@ def main() -> None:
     except Exception as error:
         if os.environ.get("EIGENHEAD_DEBUG"):
             raise
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        if isinstance(error, OSError) and error.errno in DISK_FULL:
             fail("the disk is full: make room, then run the same command again")
         if isinstance(error, OSError) and error.filename:
             fail(f"{error.filename} cannot be used ({error.strerror}): name another place, or mend who may use it")

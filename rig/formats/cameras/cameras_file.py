@@ -178,12 +178,9 @@ def read_cameras(path: Path) -> CamerasRead:
             fault = compose("picture-link-broken", picture=path.name, target=str(path.readlink()))
             raise InputError(path.name, [fault])
         head = head_of(path)
-        contents = {
-            _read_json: re.search(OWN, head),
-            read_csv: looks_like_csv(head),
-            read_metashape: re.search(CHUNK, head),
-        }
-        reader = next((read for read, fits in contents.items() if fits), readers[suffix])
+        own, metashape = re.search(OWN, head), re.search(CHUNK, head)
+        contents = (own and _read_json, metashape and read_metashape, looks_like_csv(head) and read_csv)
+        reader = next(filter(None, contents), readers[suffix])
         return _thinned(reader(path), path.name)
     except InputError:
         if (program := program_of(path)) is None:
