@@ -178,8 +178,8 @@ def read_cameras(path: Path) -> CamerasRead:
             fault = compose("picture-link-broken", picture=path.name, target=str(path.readlink()))
             raise InputError(path.name, [fault])
         head = head_of(path)
-        own, metashape = re.search(OWN, head), re.search(CHUNK, head)
-        contents = (own and _read_json, metashape and read_metashape, looks_like_csv(head) and read_csv)
+        native, metashape = re.search(OWN, head), re.search(CHUNK, head)
+        contents = (native and _read_json, metashape and read_metashape, looks_like_csv(head) and read_csv)
         reader = next(filter(None, contents), readers[suffix])
         return _thinned(reader(path), path.name)
     except InputError:
