@@ -178,9 +178,9 @@ def read_cameras(path: Path) -> CamerasRead:
             fault = compose("picture-link-broken", picture=path.name, target=str(path.readlink()))
             raise InputError(path.name, [fault])
         head = head_of(path)
-        native, metashape = re.search(OWN, head), re.search(CHUNK, head)
-        contents = (native and _read_json, metashape and read_metashape, looks_like_csv(head) and read_csv)
-        reader = next(filter(None, contents), readers[suffix])
+        contents = ((re.search(OWN, head), _read_json), (re.search(CHUNK, head), read_metashape))
+        reader = next((read for fits, read in contents if fits), readers[suffix])
+        reader = read_csv if looks_like_csv(head) else reader
         return _thinned(reader(path), path.name)
     except InputError:
         if (program := program_of(path)) is None:
