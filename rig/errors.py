@@ -1,8 +1,11 @@
 """Defines the base classes of all exceptions. Every exception's message states the fault and a remedy."""
 
+import errno
 from collections.abc import Iterable
 
 from rig.messages.message import Message, compose, message_of
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class EigenheadError(Exception):

@@ -24,6 +24,7 @@ from rig.errors import InputError
 from rig.files import write_atomically
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.messages.message import Message, compose
+from rig.text import as_utf8
 
 Kind = Literal["checkerboard", "charuco"]
 SQUARES_LEAST, SQUARES_MOST = 3, 60
@@ -126,9 +127,11 @@ class Board:
 def read_board(path: Path) -> Board:
     """Reads a board from a ``board.toml`` file. Raises an InputError that names every fault."""
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        document = tomllib.loads(as_utf8(path.read_bytes()).decode())
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(path.name, [compose("no-toml", reason=str(error))]) from error
+        other = path.suffix.lower() != ".toml" or isinstance(error, UnicodeDecodeError)
+        fault = compose("board-not-described") if other else compose("no-toml", reason=str(error))
+        raise InputError(path.name, [fault]) from error
     return board_from_document(document, path.name)
 
 

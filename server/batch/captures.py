@@ -54,7 +54,7 @@ def find_captures(folder: Path, out: Path) -> tuple[BatchCapture, ...]:
     """
     if is_capture(folder) and (find_rig_file(folder) is not None or entry(folder, "images").is_dir()):
         raise InputError(folder.name, [compose("batch-folder-is-capture")])
-    captures = [BatchCapture(_name(path, folder), path) for path in _walk(folder, out.resolve())]
+    captures = [BatchCapture(_name(path, folder), path) for path in _walk(folder, Path(os.path.realpath(out)))]
     if not captures:
         raise InputError(folder.name, [compose("batch-folder-empty")])
     faults = _name_faults(captures, [capture.path.relative_to(folder).as_posix() for capture in captures])
@@ -107,7 +107,8 @@ def read_list(path: Path) -> tuple[BatchCapture, ...]:
 
 def _walk(folder: Path, out: Path) -> Iterator[Path]:
     for path in sorted(folder.iterdir()):
-        if is_junk(path.name) or path.resolve() == out or path.name.endswith(".truth") or path.name.lower() in ASIDE:
+        aside = is_junk(path.name) or path.name.endswith(".truth") or path.name.lower() in ASIDE
+        if aside or not path.exists() or path.resolve() == out:
             continue
         if is_capture(path):
             yield path
@@ -270,10 +271,10 @@ def _files(folder: Path, prefix: str, within: frozenset[tuple[int, int]]) -> Ite
     state = folder.stat()
     if (here := (state.st_dev, state.st_ino)) in within:
         return
-    for found in os.scandir(folder):
-        if is_junk(found.name):
+    for path in folder.iterdir():
+        if is_junk(path.name):
             continue
-        if found.is_dir():
-            yield from _files(Path(found.path), f"{prefix}{found.name}/", within | {here})
-        elif found.is_file():
-            yield f"{prefix}{found.name}", Path(found.path)
+        if path.is_dir():
+            yield from _files(path, f"{prefix}{path.name}/", within | {here})
+        elif path.is_file():  # not of a link to itself
+            yield f"{prefix}{path.name}", path

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Concatenate, Literal, Protocol
 
-from rig.errors import Cancelled, EigenheadError, InputError
+from rig.errors import DISK_FULL, Cancelled, EigenheadError, InputError
 from rig.messages.message import Message, compose
 from rig.progress import Progress
 from server.batch.captures import WHOLE, Shard, capture_sha256
 from server.batch.folder import BatchFolder, FailureRecord, Origin
-from server.tasks.child import DISK_FULL, Child, WorkerContext, WorkFailed
+from server.tasks.child import Child, WorkerContext, WorkFailed
 from server.tasks.progress import JobProgress
 from server.tasks.reconstruct import reconstruct_beside
 

@@ -10,9 +10,10 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import wraps
 from pathlib import Path
 from threading import Event
-from time import monotonic
+from time import monotonic, time
 from types import FrameType
 from typing import Annotated, Any, NoReturn
 
@@ -28,6 +29,8 @@ os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 
 LINE_S = 30.0  # between lines of progress in a log
+RESUMED = ("batch", "sequence")  # commands that make only what an earlier run left unmade
+GOING_ON = (*RESUMED, "reconstruct", "take", "export")  # the latter keep cameras and masks that they estimated
 
 
 class CannotWrite(EigenheadError):
@@ -198,20 +201,29 @@ def _remove_empty(folders: Iterable[Path]) -> None:
             folder.rmdir()
 
 
-@contextmanager
-def terminated_like_interrupted() -> Iterator[None]:
-    """Makes SIGTERM end the block as Ctrl-C does, so that no unfinished file remains. Job schedulers send SIGTERM some
-    seconds before SIGKILL."""
+def stoppable(run: Callable[..., Any], name: str) -> Callable[..., Any]:
+    """Returns the function of a command that SIGTERM ends as Ctrl-C does, so that no unfinished file remains: with a
+    line on what was written, and status 130. Job schedulers send SIGTERM some seconds before SIGKILL."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-        sys.stderr.flush()
+    @wraps(run)
+    def command(out: str | None = None, **values: Any) -> None:
+        since_s = 0.0 if name in RESUMED else time() - 0.02  # files are dated by a clock of 10 ms steps
+        before = signal.signal(signal.SIGTERM, stop)
+        try:
+            run(**values, **({} if out is None else {"out": out}))
+        except KeyboardInterrupt:
+            paths = [] if out is None else [Path(out), *Path(out).rglob("*")]
+            written = any(path.is_file() and path.stat().st_mtime >= since_s for path in paths)
+            again = "run the same command again to go on" if name in GOING_ON else f"{out} is not complete"
+            print(f"eigenhead: Stopped; {again if written else 'nothing was written'}", file=sys.stderr, flush=True)
+            raise typer.Exit(130) from None
+        finally:
+            signal.signal(signal.SIGTERM, before)
+
+    return command
 
 
 @contextmanager
@@ -247,9 +259,9 @@ def answer(document: Any, as_json: bool, lines: list[str]) -> None:
     print(json.dumps(document, allow_nan=False) if as_json else "\n".join(lines))
 
 
-def warn(message: str) -> None:
-    """Prints a warning on standard error, unless ``--quiet`` was given, and lets the command continue."""
-    if not QUIET.is_set():
+def warn(*messages: str) -> None:
+    """Prints warnings on standard error, unless ``--quiet`` was given, and lets the command continue."""
+    for message in () if QUIET.is_set() else messages:
         print(f"eigenhead: {message}", file=sys.stderr)
 
 

@@ -12,21 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.errors import EigenheadError, InputError, how_to_install
+from rig.errors import InputError, how_to_install
 from rig.messages.message import compose
-from server.cli.answers import (
-    QUIET,
-    Anyway,
-    Data,
-    Json,
-    Strict,
-    answer,
-    fail,
-    prepare_folder,
-    terminated_like_interrupted,
-    warn,
-    wrong_usage,
-)
+from server.cli.answers import QUIET, Anyway, Data, Json, Strict, answer, fail, prepare_folder, warn, wrong_usage
 from server.cli.heads import Detail, Formats, Method, Model, Surface
 
 if TYPE_CHECKING:
@@ -36,14 +24,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(rich_markup_mode=None)
 NAMED_MOST = 10  # failed captures that the last line names; the table lists all
-
-
-class CapturesFailed(EigenheadError):
-    """Reports at the end of a batch that some captures failed; the results of the other captures are complete."""
-
-    def __init__(self, failed: Sequence[str], count: int) -> None:
-        names = [*failed[:NAMED_MOST], *(["..."] if len(failed) > NAMED_MOST else [])]
-        super().__init__(compose("batch-failed", count=len(failed), all=count, names=names))
 
 
 @app.command(
@@ -82,10 +62,12 @@ def batch(
     """Reconstruct many captures, and make a table of all heads.
 
     Stop it at any moment and run it again: only what is missing is made. Status 1 where a capture failed."""
+    from server.batch.captures import WHOLE, read_shard
     from server.batch.plan import plan_batch
     from server.tasks.settings_file import settings_document
 
-    share = _share(shard)
+    with wrong_usage("--shard"):
+        share = WHOLE if shard is None else read_shard(shard)
     outputs = {"surface": surface, "formats": formats.split(",") if formats else None}
     requested = {name: value for name, value in outputs.items() if value}
     options = {"outputs": requested or None, "anyway": anyway or None}
@@ -98,13 +80,6 @@ def batch(
     _run(tasks, out, workers, share, json_out)
 
 
-def _share(text: str | None) -> "Shard":
-    from server.batch.captures import WHOLE, read_shard
-
-    with wrong_usage("--shard"):
-        return WHOLE if text is None else read_shard(text)
-
-
 def _captures_in(captures: Path, out: Path) -> "tuple[BatchCapture, ...]":
     """Returns the captures of a folder or list. Raises InputError for a wrong list, and if ``out`` lies within a
     capture."""
@@ -113,7 +88,7 @@ def _captures_in(captures: Path, out: Path) -> "tuple[BatchCapture, ...]":
     if captures.is_file() and is_archive(captures):
         raise InputError(captures.name, [compose("batch-folder-is-capture")])
     captures_found = find_captures(captures, out) if captures.is_dir() else read_list(captures)
-    out_folder = out.resolve()
+    out_folder = Path(os.path.realpath(out))  # which bears a link to itself
     faults = [
         compose("batch-out-within", out=str(out), capture=capture.name)
         for capture in captures_found
@@ -135,7 +110,7 @@ def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "S
     folder, cores = BatchFolder(out), usable_cores()
     count = workers or worker_count(cores, free_memory(), len(share_tasks))
     files: list[Path] = []
-    with terminated_like_interrupted(), BatchDisplay.opened(count, share_tasks) as display:
+    with BatchDisplay.opened(count, share_tasks) as display:
         display.prepare(share_tasks)
         threads = os.environ.get(THREADS) or str(threads_of_worker(cores, count))  # the user's choice goes before ours
         run = BatchRun(folder, share_tasks, workers=count, variables={THREADS: threads}, observer=display, shard=share)
@@ -150,7 +125,8 @@ def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "S
     counts = ", ".join(f"{document[state]} {state}" for state in ("made", "kept", "failed"))
     answer(document, json_out, [*map(str, files), counts])
     if failed:
-        fail(str(CapturesFailed([outcome.name for outcome in failed], len(share_tasks))))
+        names = [outcome.name for outcome in failed[:NAMED_MOST]] + ["..."] * (len(failed) > NAMED_MOST)
+        fail(compose("batch-failed", count=len(failed), all=len(share_tasks), names=names).text)
 
 
 def _document(

@@ -126,8 +126,7 @@ def _calibrate_lenses(images: Path, board: Path, out: Path, json_out: bool) -> N
     said = [compose("camera-without-board", camera=name, why=compose("no-picture-of-board")) for name in absent]
     if not lenses:
         raise CalibrationRefused(said)
-    for message in (*said, *(lens.weakness for lens in lenses.values() if lens.weakness)):
-        warn(message.text)
+    warn(*texts_of([*said, *(lens.weakness for lens in lenses.values() if lens.weakness)]))
     cameras = []
     for name, lens in lenses.items():
         k, figures = lens.intrinsics, {"rms_px": lens.rms_px, "views": lens.views, "sigma": lens.sigma.tolist()}
@@ -147,7 +146,6 @@ def _calibrate_board(
     from calibration.calibrate import calibrate as run
     from calibration.report import report_page
     from calibration.result import CalibrationRefused
-    from rig.files import write_atomically
     from rig.formats.cameras.cameras_json import read_rig, write_rig
 
     known = None if previous is None else read_rig(previous)
@@ -177,7 +175,6 @@ def _calibrate_scene(
 ) -> None:
     from calibration.scene.result import scene_page
     from calibration.scene.scene import calibrate_scene
-    from rig.files import write_atomically
     from rig.formats.cameras.cameras_json import write_rig
 
     page = out.with_suffix(".html")
@@ -192,8 +189,7 @@ def _calibrate_scene(
         for name, figure in figures["cameras"].items()
     ]
     total = f"{figures['rms_px']:.3f} px over {figures['points']} points; front camera {calibration.front}"
-    for warning in calibration.warnings:
-        warn(warning.text)
+    warn(*texts_of(calibration.warnings))
     lines = [str(out), str(page), *cameras, total, f"scale: {calibration.scale.provenance}"]
     answer(calibration.document(), json_out, lines)
 
@@ -217,7 +213,6 @@ def refine(
     warn_of_replacement(out, overwrite)
     prepare_file(out)
     from calibration.silhouette_refinement.report import refinement_page
-    from rig.files import write_atomically
     from rig.formats.cameras.cameras_json import write_rig
     from server.tasks.refine import refine_locally
 
@@ -261,8 +256,7 @@ def convert(
     rig = read.rig
     if faults := rig_faults(rig, any_unit=entry(file.parent, "scale.json").is_file()):
         raise InputError(file.name, faults)
-    for remark in read.remarks:
-        warn(f"{remark.code}: {remark}")
+    warn(*(f"{remark.code}: {remark}" for remark in read.remarks))
     warn_of_replacement(out, overwrite)
     prepare = prepare_folder if to in FOLDER_FORMATS else prepare_file
     prepare(out)

@@ -43,8 +43,7 @@ def compare(
 
     comparison = compare_visits(read_visit(earlier, model), read_visit(later, model))
     document = write_comparison(out, comparison, date.today().isoformat())
-    for warning in comparison.warnings:
-        warn(str(warning))
+    warn(*map(str, comparison.warnings))
     answer(document | {"out": str(out)}, json_out, _comparison_lines(comparison, out))
 
 
@@ -103,8 +102,7 @@ def register(
     patient = read_surface(surface, axes)
     marks = None if landmarks is None else read_surface_landmarks(landmarks, patient.axes)
     visit = read_visit(result, model)
-    for warning in visit.warnings:
-        warn(str(warning))
+    warn(*map(str, visit.warnings))
     registered = register_head(visit, patient, marks)
     document = write_registration(out, registered)
     answer(document | {"out": str(out)}, json_out, _registration_lines(document, out))
@@ -159,8 +157,7 @@ def measure(
     chosen = [
         choose_size(of, measures[of.measure].value, measures[of.measure].std) for of in tables if of.measure in measures
     ]
-    for warning in (*visit.warnings, *absent):
-        warn(str(warning))
+    warn(*map(str, (*visit.warnings, *absent)))
     document = {
         "warnings": documents_of([*visit.warnings, *absent]),
         "measures": {

@@ -1,10 +1,12 @@
 """Implements ``eigenhead export``, which writes a capture or a result for other programs."""
 
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from rig.errors import EigenheadError
 from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, file_in, prepare_folder, progress_bar, warn
 from server.cli.heads import Albedo, Morphs, TemplateName
 
@@ -92,16 +94,21 @@ def _export_dataset(
     """Writes a capture as a data set."""
     from pipeline.settings import settings_from_document
     from server.cli.reconstruct_local import check_apart
-    from server.tasks.export_dataset import export_folder
+    from server.tasks.export_dataset import FOUND, export_folder
     from server.tasks.reconstruct import folder_of
     from server.tasks.settings_file import settings_document
 
     wanted = settings_from_document(settings_document(settings))
     check_apart(out, capture)
-    with progress_bar() as report, folder_of(capture) as folder:
-        figures, warnings = export_folder(folder, out, form, result=result, chosen=wanted, report=report)
-    for warning in warnings:
-        warn(f"{warning.code}: {warning}")
+    found_before = (out / FOUND).exists()
+    try:
+        with progress_bar() as report, folder_of(capture) as folder:
+            figures, warnings = export_folder(folder, out, form, result=result, chosen=wanted, report=report)
+    except EigenheadError:
+        if not found_before:
+            shutil.rmtree(out / FOUND, ignore_errors=True)
+        raise
+    warn(*(f"{warning.code}: {warning}" for warning in warnings))
     summary = (
         f"{len(figures['cameras'])} views"
         + (", FLAME parameters" if figures["flame"] else "")

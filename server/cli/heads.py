@@ -35,18 +35,6 @@ if TYPE_CHECKING:
 app = typer.Typer(rich_markup_mode=None)
 
 
-class LimitsMissed(EigenheadError):
-    """Reports that a figure of a verification exceeds its limit. Report and certificate have already been written."""
-
-    def __init__(self, document: "VerificationReport", out: Path) -> None:
-        missed = [
-            f"{name} is {check['value']:.3g}, the limit is {check['limit']:g}"
-            for name, check in document["checks"].items()
-            if check["passed"] is False and check["value"] is not None
-        ]
-        super().__init__(f"not passed: {'; '.join(missed)} ({out / 'certificate.pdf'} says where)")
-
-
 def _templates() -> tuple[str, ...]:
     from pipeline.applications.templates.header import list_templates
 
@@ -170,8 +158,7 @@ def reconstruct(
     warn_of_replacement(out / "report.json", overwrite)
     with progress_bar() as report:
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report, trace=trace)
-    for warning in written["warnings"]:
-        warn(f"{warning['code']}: {warning['message']}")
+    warn(*(f"{warning['code']}: {warning['message']}" for warning in written["warnings"]))
     names = ("contact_sheet.png", "head.ply", "bust.ply", f"head-{template}.obj")  # in the order of looking at them
     files = [out / name for name in names if (out / name).is_file()]
     answer(written, json_out, [*(str(path) for path in files), *flame_lines(written, out)])
@@ -234,7 +221,12 @@ def verify(
         )  # fmt: skip
     answer(verification, json_out, verification_lines(verification, out))
     if not verification["passed"]:
-        raise LimitsMissed(verification, out)
+        missed = [
+            f"{name} is {figure['value']:.3g}, the limit is {figure['limit']:g}"
+            for name, figure in verification["checks"].items()
+            if figure["passed"] is False and figure["value"] is not None
+        ]
+        raise EigenheadError(f"not passed: {'; '.join(missed)} ({out / 'certificate.pdf'} says where)")
 
 
 @app.command(epilog="Example: eigenhead demo --out out/demo")

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup, TyperOption
 
-from rig.errors import EigenheadError
+from rig.errors import DISK_FULL, EigenheadError
 from server.cli import batch, cameras, clinic, export, heads, models, moments, rig, service, simulate, templates
-from server.cli.answers import QUIET, fail, use_threads
+from server.cli.answers import QUIET, fail, stoppable, use_threads
 
 ROOMS = {  # page below docs/commands: its title, and its commands in the order of a day's work
     "heads": ("Heads", ("reconstruct", "take", "sequence", "batch", "check", "export")),
@@ -32,6 +32,8 @@ class Commands(TyperGroup):
         super().__init__(**attributes)
         for command in _leaves(self):
             command.epilog = "\b\n" + (command.epilog or "").replace("   ", "\n")
+            if command.name == "check" or ("out", ["--out"]) in ((each.name, each.opts) for each in command.params):
+                command.callback = stoppable(command.callback, command.name)
             command.params += [_option("--threads", use_threads, THREADS, type=int, metavar="N")]
             command.params += [
                 _option(
@@ -101,14 +103,14 @@ def main() -> None:
         fail(str(error))
     except MemoryError as error:
         fail(f"more memory is needed than there is ({error}): a file is too large, or not what it says")
-    except KeyboardInterrupt:
-        sys.exit(130)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except Exception as error:
         if os.environ.get("EIGENHEAD_DEBUG"):
             raise
+        if isinstance(error, OSError) and error.errno in DISK_FULL:
+            fail("the disk is full: make room, then run the same command again")
         if isinstance(error, OSError) and error.filename:
             fail(f"{error.filename} cannot be used ({error.strerror}): name another place, or mend who may use it")
         fail(f"{type(error).__name__}: {error} (EIGENHEAD_DEBUG=1 shows where)")

@@ -17,7 +17,6 @@ from server.cli.answers import (
     prepare_file,
     prepare_folder,
     progress_bar,
-    terminated_like_interrupted,
     warn,
     warn_of_replacement,
     wrong_usage,
@@ -74,8 +73,7 @@ def take(
                 found = read_or_calibrate(folder, kept, front=chosen.front, report=report)
             shots[name] = Shot(found.capture, found.rig, partial(keep_masks, kept))
         document = make_take(out, shots, model=model or "default", settings=chosen, report=report)
-    for line in warning_lines(document):
-        warn(line)
+    warn(*warning_lines(document))
     answer(document, json_out, [str(out / name) for name in ("neutral.ply", "neutral.glb", "moments")])
 
 
@@ -109,7 +107,7 @@ def sequence(
     chosen = settings_from_document(head_alone(settings_document(None, detail="photo")))
     check_apart(out, folder)
     prepare_folder(out)
-    with progress_bar() as report, terminated_like_interrupted():
+    with progress_bar() as report:
         prepare_kernels(report, chosen)
         document = make_sequence(
             folder, out, model=model or "default", settings=chosen, report=report, usd=usd,
@@ -117,8 +115,7 @@ def sequence(
         )  # fmt: skip
     if document is None:
         return answer({"shard": str(part)}, json_out, [f"part {part} is done; others are not yet"])
-    for warning in document["warnings"]:
-        warn(f"{warning['code']}: {warning['message']}")
+    warn(*(f"{warning['code']}: {warning['message']}" for warning in document["warnings"]))
     answer(document, json_out, [str(out / name) for name in (*FILES, *[CACHE][:usd])])
 
 

@@ -1,8 +1,9 @@
 """Implements ``eigenhead reconstruct``: reconstructs one capture in this process, without the service."""
 
 import json
+import os
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ from rig.files import write_atomically
 from rig.formats.captures.capture_folder import capture_root
 from rig.formats.captures.shot_files import BESIDE_PICTURES, picture_folder
 from rig.progress import Progress
-from server.cli.answers import CannotWrite, SpoilsCapture, prepare_file, terminated_like_interrupted
+from server.cli.answers import SpoilsCapture, prepare_file, prepare_folder
 from server.processes import share_one_heap
 from server.storage.result_folder import fresh_folder
 from server.tasks.child import WorkerContext
@@ -48,14 +49,8 @@ def reconstruct_locally(
     if trace is not None:
         check_apart(trace.parent, capture, "--trace")
         prepare_file(trace, option="--trace")
-    with ExitStack() as stack:
-        stack.enter_context(terminated_like_interrupted())
-        stack.enter_context(_traced(trace))
-        try:
-            fresh = stack.enter_context(fresh_folder(out))
-        except OSError as error:
-            raise CannotWrite(out, error) from error
-        folder, context = stack.enter_context(folder_of(capture)), stack.enter_context(closing(WorkerContext()))
+    prepare_folder(out)
+    with _traced(trace), fresh_folder(out) as fresh, folder_of(capture) as folder, closing(WorkerContext()) as context:
         durations, megapixels = StageDurations(), megapixels_of(folder)
         progress = JobProgress(durations.of(chosen, megapixels))
 
@@ -87,7 +82,8 @@ def check_apart(out: Path, capture: Path, option: str = "--out") -> None:
 
     if not capture.is_dir():
         return
-    out_folder, whole, root = out.resolve(), capture.resolve(), capture_root(capture).resolve()
+    out_folder = Path(os.path.realpath(out))  # which bears a link to itself
+    whole, root = capture.resolve(), capture_root(capture).resolve()
     pictures = [root / kind for kind in ("images", *BESIDE_PICTURES, TEXTURE_SETS)]
     pictures += [picture_folder(root)] if photographs_alone(root) else []  # there every folder counts as a camera's
     # The root is recognised as the only folder within ``whole``: a result beside it would hide it.

@@ -8,7 +8,6 @@ The child runs this module, is connected to its parent by a socket, and ends whe
 outlives the parent.
 """
 
-import errno
 import importlib
 import os
 import pickle
@@ -28,14 +27,13 @@ from multiprocessing.connection import Connection
 from types import MappingProxyType
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from rig.errors import Cancelled, EigenheadError, InputError
+from rig.errors import DISK_FULL, Cancelled, EigenheadError, InputError
 from rig.messages.message import Message, compose, message_of, verbatim
 from rig.progress import Progress
 from server.processes import SERVER, python_command, python_environment
 
 PATIENCE_S = 0.5  # between asking a piece of work to stop and killing it: a cancellation takes effect within a second
 REPORT_EVERY_S = 0.05
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 P = ParamSpec("P")
 T = TypeVar("T")

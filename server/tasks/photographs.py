@@ -74,7 +74,6 @@ def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Pr
     from calibration.scene.photographs import find_photographs
 
     root = capture_root(folder)
-    kept.mkdir(parents=True, exist_ok=True)
     warnings = calibrate_photographs(root, kept, front=front, report=report)
     rig, faults = read_rig(kept / CAMERAS), list[Message]()
     files = find_files(root, rig, [name for name in find_photographs(root).names if name not in rig])
@@ -174,7 +173,6 @@ def keep_masks(kept: Path, capture: Capture, rig: Rig, *, report: Progress) -> d
     if capture.masks or capture.backgrounds:
         return segment(capture, rig, report=report)
     masks, cache = kept / "masks", kept / CACHE
-    masks.mkdir(parents=True, exist_ok=True)
     full = read_rig(kept / CAMERAS) if (kept / CAMERAS).is_file() else rig
     before = set(cache.glob(f"*{SUFFIX}"))
     found = segment_once(cache, capture, rig, report=report)

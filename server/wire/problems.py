@@ -1,7 +1,6 @@
 """Turns errors into problem documents (RFC 9457, ``application/problem+json``) with a stable ``type`` and every fault
 in ``errors``."""
 
-import errno
 from collections.abc import Iterable, Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
@@ -15,7 +14,7 @@ from sqlalchemy.exc import DataError, DBAPIError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from rig.errors import EigenheadError, InputError
+from rig.errors import DISK_FULL, EigenheadError, InputError
 from rig.messages.message import Message, compose, documents_of, message_of
 from rig.text import printable
 from server.errors import (
@@ -37,7 +36,6 @@ from server.errors import (
 from server.problem_types import HTTP_TYPES, PROBLEM_TYPES, URN
 
 MEDIA_TYPE = "application/problem+json"
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 log = structlog.get_logger()
 

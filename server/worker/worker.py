@@ -37,7 +37,7 @@ from dbos import error as dbos_error
 from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.settings import PHOTO_LEVELS, settings_from_document
-from rig.errors import Cancelled, InputError
+from rig.errors import DISK_FULL, Cancelled, InputError
 from rig.files import sha256_of, write_atomically
 from rig.messages.message import Message, MessageDocument, compose
 from rig.progress import Progress
@@ -59,7 +59,7 @@ from server.storage.job_index import RUNNING, engine_jobs
 from server.storage.records import EventDocument, FileEntry, JobRequest, JobWebhook, JsonObject, WebhookMessage
 from server.storage.store import Store
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
-from server.tasks.child import DISK_FULL, ChildProcessPool, WorkerContext, WorkFailed, function_at
+from server.tasks.child import ChildProcessPool, WorkerContext, WorkFailed, function_at
 from server.tasks.progress import EVERY_S, JobProgress, ProgressMeter
 from server.tasks.reconstruct import reconstruct_capture
 from server.tasks.stage_durations import StageDurations, megapixels_of

@@ -189,6 +189,7 @@ def read_delivered(
     """Reads results that were made with ``model``. Returns the heads, and the reasons why results were left out, by
     their path below ``folder``. Raises InputError that lists every damaged result."""
     names, points, deviations, skipped, faults = [], [], [], {}, []
+    used: dict[frozenset[str], str] = {}  # by the digests of a result's pictures
     for k, place in enumerate(folders):
         name = place.relative_to(folder).as_posix() if place != folder else place.name
         try:
@@ -199,6 +200,9 @@ def read_delivered(
         doubts = tuple(code for code in measured.warnings if code in DOUBTFUL)
         if doubts:
             skipped[name] = compose("result-doubtful", warnings=doubts)
+            continue
+        if (first := used.setdefault(measured.pictures or frozenset([name]), name)) != name:
+            skipped[name] = compose("result-of-same-capture", other=first)
             continue
         names.append(name)
         points.append(_neutral_points(model, measured))

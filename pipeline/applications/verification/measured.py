@@ -36,6 +36,7 @@ class Measured:
     head_from_world: RigidTransform
     warnings: tuple[str, ...] = ()  # codes
     expression: Mapping[str, float] = field(default_factory=dict)  # weights by the model's names
+    pictures: frozenset[str] = frozenset()  # SHA-256 of the photographs
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +75,8 @@ def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
         translation = place["scale"] * np.array(place["translation"], float)
         codes = tuple(str(warning["code"]) for warning in report["warnings"])
         expression = {str(each["name"]): float(each["weight"]) for each in report.get("expression", ())}
+        inputs = report.get("inputs", {}).items()
+        pictures = frozenset(str(sha256) for name, sha256 in inputs if name.startswith("images/"))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{name}/report.json", [f"is no report that can be read ({error!r})"]) from error
     return Measured(
@@ -86,6 +89,7 @@ def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
         head_from_world=RigidTransform(rotation, translation).inverse(),
         warnings=codes,
         expression=expression,
+        pictures=pictures,
     )
 
 
@@ -94,6 +98,10 @@ def read_report(folder: Path) -> ReportDocument:
     try:
         return json.loads((folder / "report.json").read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError) as error:
+        below = sorted(path.name for path in folder.glob("*") if is_result(path))
+        if below:
+            several = compose("results-below", names=below[:3], count=len(below), first=str(folder / below[0]))
+            raise InputError(str(folder), [several]) from error
         raise InputError(f"{folder}/report.json", [compose("report-missing")]) from error
     except (OSError, ValueError) as error:
         raise InputError(f"{folder.name}/report.json", [f"cannot be read ({error})"]) from error

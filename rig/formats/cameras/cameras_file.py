@@ -60,6 +60,7 @@ LENS_MODELS: dict[str, set[str]] = {
     **{model: {"model", "skew", *keys} for model, keys in COEFFICIENTS.items()},
 }
 OWN = r"\A\W*format\W+eigenhead-cameras/"  # with which a cameras.json begins, whatever its name
+CHUNK = r"<chunk\b"  # in Metashape's XML
 TOLD_MOST = 8  # keys named one by one; the others are counted
 
 WRITERS: dict[str, Callable[[Rig, Path], None]] = {
@@ -148,12 +149,12 @@ def rig_files(folder: Path) -> Iterator[Path]:
         [nersemble],
         [easymocap],
         of(".yml", ".yaml", mark=r"\nK_"),
-        of(".xml", mark=r"<chunk\b"),
+        of(".xml", mark=CHUNK),
         of(".xmp", mark="capturingreality", among=[*beside, *here]),
         (path for path in of(".csv") if looks_like_csv(head_of(path))),
         (path for path in of(".json", ".txt", mark=OWN) if path != native),  # "cameras (1).json", "cameras.json.txt"
     ):
-        first = next((path for path in found if path.is_file()), None)
+        first = next((path for path in found if path.is_file() or path.is_symlink()), None)  # a broken link is told
         if first is not None:
             yield first
 
@@ -173,7 +174,13 @@ def read_cameras(path: Path) -> CamerasRead:
     try:
         if suffix not in readers:
             raise InputError(path.name, [compose("no-rig-ending", endings=[*readers], formats=FORMATS[:-1])])
-        reader = _read_json if re.search(OWN, head_of(path)) else readers[suffix]
+        if path.is_symlink() and not path.exists():
+            fault = compose("picture-link-broken", picture=path.name, target=str(path.readlink()))
+            raise InputError(path.name, [fault])
+        head = head_of(path)
+        contents = ((re.search(OWN, head), _read_json), (re.search(CHUNK, head), read_metashape))
+        reader = next((read for fits, read in contents if fits), readers[suffix])
+        reader = read_csv if looks_like_csv(head) else reader
         return _thinned(reader(path), path.name)
     except InputError:
         if (program := program_of(path)) is None:

@@ -211,6 +211,7 @@ TEMPLATES = {
     "cameras-scaled": "the cameras were scaled by {factor:.4g}: {scale}",
     "model-without-shapes": "the shapes cannot be written, because the model {model} has no expressions. Leave them out, or reconstruct with a model that has expressions, such as makehuman-138",
     "report-missing": "the file is not there: name the folder of a result, which holds report.json and head.ply",
+    "results-below": "the folder holds the results of {count} captures ({names}), so it is no result itself: name one of them, such as {first}",
     "report-unread": "report.json cannot be read ({reason})",
     "sizes-unread": "the file is not a TOML file of sizes ({reason}): write lines such as {example}",
     "sizes-no-table": 'the file has no [[table]], or does not begin with format = "{format}": write lines such as {example}',

@@ -70,6 +70,7 @@ def test_the_ruler_is_100_mm_long_and_the_same_board_gives_the_same_bytes(tmp_pa
 @pytest.mark.parametrize("board", BOARDS, ids=lambda b: f"{b.kind}-{b.columns}x{b.rows}")
 def test_what_is_written_is_read_back(board: Board, tmp_path: Path) -> None:
     write_board(board, tmp_path / "board.toml")
+    (tmp_path / "board.toml").write_text((tmp_path / "board.toml").read_text(), encoding="utf-16")
     assert read_board(tmp_path / "board.toml") == board
 
 
@@ -80,6 +81,9 @@ def test_every_fault_of_a_board_is_named(tmp_path: Path) -> None:
         read_board(path)
     for key in ("kind", "columns", "rows", "square_mm", "colour"):
         assert any(key in fault.text for fault in error.value.faults), key
+    path.with_suffix(".pdf").write_bytes(b"%PDF-1.3 \xff")
+    with pytest.raises(InputError, match=r"is no board\.toml.*eigenhead board"):
+        read_board(path.with_suffix(".pdf"))
     write_board(replace(BOARDS[2], columns=20, rows=20), path)
     with pytest.raises(InputError, match="holds 100 markers; the board needs 200"):
         read_board(path)

@@ -210,7 +210,10 @@ def test_files_behind_links_count_and_a_circle_ends(capture: Path, tmp_path: Pat
     (capture / "images").symlink_to(tmp_path / "elsewhere")
     assert capture_sha256(capture) == before
     (capture / "images" / "again").symlink_to(capture)
+    (capture / "itself").symlink_to("itself")
     assert capture_sha256(capture) == before
+    (tmp_path / "itself").symlink_to("itself")
+    assert capture in [found.path for found in find_captures(tmp_path, tmp_path / "itself")]
 
 
 def test_an_archive_is_its_bytes(tmp_path: Path) -> None:

@@ -106,6 +106,7 @@ def test_a_scheduler_and_ctrl_c_end_it_and_leave_nothing(shots: Path, tmp_path: 
         await_true(lambda: not (not log.exists() or log.read_text().count("begins") < 2), 60)
         children = [int(line.split()[3]) for line in log.read_text().splitlines()]
         running.send_signal(number)
-        assert running.wait(45) == 130
+        assert running.communicate(timeout=45)[1].endswith(b"eigenhead: Stopped; nothing was written\n")
+        assert running.returncode == 130
     assert not out.exists()
     assert not [child for child in children if Path(f"/proc/{child}").exists()]

@@ -165,6 +165,11 @@ def test_a_result_of_another_capture_is_refused_by_its_files(shot: Shot, tmp_pat
     assert refused.exit_code == 1
     assert "was made of another cameras.json than this capture has" in str(refused.exception)
     assert not (tmp_path / "out" / "transforms.json").exists()
+    (tmp_path / "one").mkdir()
+    shutil.copy(next((shot[0] / "images").iterdir()), tmp_path / "one")
+    alone = CliRunner().invoke(app, ["export", str(tmp_path / "one"), *arguments[2:], str(tmp_path)])
+    assert "at least 3 from different places" in str(alone.exception)
+    assert not (tmp_path / "out" / "found").exists()
     (tmp_path / "report.json").unlink()
     assert "has no report.json" in str(CliRunner().invoke(app, [*arguments, str(tmp_path)]).exception)
 

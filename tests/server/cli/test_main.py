@@ -2,9 +2,9 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 from typing import get_args, get_type_hints
 
@@ -13,13 +13,13 @@ import typer
 
 from pipeline import settings
 from pipeline.settings import OutputSettings, Settings
+from rig.files import write_atomically
 from rig.formats.cameras.cameras_file import FORMATS, write_rig_file
 from rig.formats.cameras.dataset_json import DATASET_FORMATS
-from server.cli import answers
+from server.cli import answers, main
 from server.cli.answers import service_settings
 from server.cli.cameras import CameraFormat
 from server.cli.export import ExportFormat
-from server.cli.main import ROOMS
 from tests.support import fork_server
 from tests.support.services import ROOT, small_capture
 from tests.support.small_captures import small_rig
@@ -47,7 +47,7 @@ def test_every_command_has_help_with_an_example(command: str) -> None:
 def test_commands_are_listed_in_rooms_and_choices_are_those_of_the_settings() -> None:
     shown = run("--help").stdout
     assert [line[:-1] for line in shown.splitlines() if line.endswith(":")][1:] == [
-        title for title, _ in ROOMS.values()
+        title for title, _ in main.ROOMS.values()
     ]
     shown = " ".join(run("reconstruct", "--help").stdout.split())
     for name, kind in (("method", Settings), ("detail", Settings), ("device", Settings), ("surface", OutputSettings)):
@@ -72,6 +72,25 @@ def test_quiet_leaves_errors_alone_and_a_log_gets_lines_of_progress(
     assert "of_nobody" in run(*command, str(tmp_path / "a.json")).stderr
     assert run(*command, str(tmp_path / "b.json"), "--quiet").stderr == ""
     assert run(*command, str(tmp_path / "no" / "\0"), "--quiet").returncode != 0
+
+
+def test_ctrl_c_leaves_one_line_on_what_was_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def write_and_stop(out: str) -> None:
+        write_atomically(Path(out, "part"), b"")
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    again = "run the same command again to go on"
+    for name, said in (("take", again), ("verify", f"{tmp_path} is not complete")):
+        with pytest.raises(typer.Exit, match="130"):
+            answers.stoppable(write_and_stop, name)(out=str(tmp_path))
+        assert capsys.readouterr().err == f"eigenhead: Stopped; {said}\n"
+
+
+def test_a_full_disk_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(main, "app", lambda: Path("/dev/full").write_bytes(b"full"))
+    with pytest.raises(SystemExit, match="1"):
+        main.main()
+    assert capsys.readouterr().err == "eigenhead: the disk is full: make room, then run the same command again\n"
 
 
 def test_a_failure_is_one_clear_line_and_status_1(tmp_path: Path) -> None:
@@ -106,15 +125,6 @@ def test_a_wrong_variable_is_wrong_usage_and_is_named(
         service_settings()
     assert refused.value.message.startswith(f"EIGENHEAD_{name}")
     assert text in refused.value.message
-
-
-def test_a_board_with_its_description_beside_it(tmp_path: Path) -> None:
-    out = tmp_path / "boards" / "board.pdf"
-    done = run("board", "--kind", "charuco", "--squares", "7x5", "--square-mm", "30", "--out", str(out), "--json")
-    written = json.loads(done.stdout)
-    assert Path(written["pdf"]).read_bytes().startswith(b"%PDF")
-    described = tomllib.loads(Path(written["board"]).read_text())
-    assert {"kind": "charuco", "columns": 7, "rows": 5, "square_mm": 30.0}.items() <= described.items()
 
 
 @pytest.mark.slow

@@ -24,21 +24,23 @@ import numpy as np
 
 from rig.files import write_atomically
 from rig.formats.meshes.mesh_file import read_mesh
+from rig.studio.devices.folder import simulate_to_folder
 from tests.laboratory.experiments.markdown import table
 from tests.support.services import free_port
 
 NEAR_MM = 8.0  # heads of the span level lie within 3 mm; heads of wrong poses or scales are off by more than 20
+Answer = tuple[bool, str]  # whether it succeeded (with a head at its place), and its words
 DOORS = ("check", "upload", "reconstruct", "batch")
 COMMAND = Path(sys.executable).with_name("eigenhead")
 SCALED = "known length|times as (large|small)|as large as|looks? like|cameras show|size of a head|too (large|small)"
 WANTED = {  # by CASE/INPUT, the longest that fits; any of these words; no words: read, and right
     "01-free-scale/x": SCALED, "01-free-scale/x1": "", "01-free-scale/x5": SCALED,
     "31-far-origin": "km from the world's origin", "05-four-to-seven-cameras": "", "08-inverted-masks": "invert",
-    "14-metashape-labels/slaves": "slave", "13-legacy-charuco/ratio-0.6": "times as wide as its squares",
+    "14-metashape-labels/slaves": "slave", "13-legacy-charuco/ratio-0.6": "times as wide as the squares",
     "19-machine-vision-pictures/mosaic": "mosaic", "19-machine-vision-pictures/twelve-bits": "12 bits",
     "23-unread-cameras-uploaded/camchain-yaml": "Kalibr", "23-unread-cameras-uploaded/calibration-json": "calib.io",
     "23-unread-cameras-uploaded/cameras-opk": "phi, kappa", "23-unread-cameras-uploaded/blocks-xml": "ContextCapture",
-    "26-one-camera-upside-down": "upside down", "28-compressed-glb": "Draco|quantised",
+    "26-one-camera-upside-down": "turned by 180 degrees", "28-compressed-glb": "Draco|quantised",
     "32-conventions/world-to-camera": "inverse", "32-conventions/opencv-axes": "negate",
     "32-conventions/centimetres": "centimetres", "32-conventions/quaternion-w-last": "real part",
 }  # fmt: skip
@@ -75,9 +77,6 @@ def reports(
     return {"lines": [*lines, f"{wrong} answers of {len(rows)} inputs are wrong"], "figures": {"wrong": wrong}}
 
 
-Answer = tuple[bool, str]  # whether it succeeded (with a head at its place), and its words
-
-
 def _judged(answer: Answer, name: str) -> str:
     done, said = answer
     wanted = next((WANTED[known] for known in sorted(WANTED, key=len, reverse=True) if name.startswith(known)), "")
@@ -97,7 +96,7 @@ def _answers(
     chosen = {name: path for name, path in chosen.items() if name not in known}
     batch = _batch(chosen, out) if "batch" in doors and chosen else {}
     for name, (folder, truth) in chosen.items():
-        answers = {"check": _checked(folder)} if "check" in doors else {}
+        answers = {"check": _command("check", folder)} if "check" in doors else {}
         answers |= {"upload": _uploaded(folder, url)} if "upload" in doors else {}
         answers |= {"reconstruct": _reconstructed(folder, truth)} if "reconstruct" in doors else {}
         yield name, answers | ({"batch": batch[name]} if "batch" in doors else {})
@@ -122,9 +121,16 @@ def _made(case: Path, out: Path) -> tuple[dict[str, tuple[Path, Path | None]], d
             others[str(words[0]), name] = done.returncode == 0, f"{done.stderr} {done.stdout}".strip()
         return done
 
+    def simulated(folder: Path, *of: Any, features: bool = True, **named: Any) -> Path:
+        truth = simulate_to_folder(folder, *of, **named)
+        if not features:
+            (folder / "features.json").unlink()
+        return truth
+
     said, changed = io.StringIO(), {"check": noted, "upload": noted, "reconstruct": noted, "eigenhead": run}
     with (
         mock.patch.multiple(common, **changed),
+        mock.patch("rig.studio.devices.folder.simulate_to_folder", simulated),  # which the cases call
         mock.patch.object(sys, "argv", [str(case / "make.py"), str(out)]),
         contextlib.redirect_stdout(said),
         contextlib.suppress(FileNotFoundError),  # of results that no door made yet
@@ -135,19 +141,16 @@ def _made(case: Path, out: Path) -> tuple[dict[str, tuple[Path, Path | None]], d
     return folders, others
 
 
-def _command(*words: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([os.environ["EIGENHEAD"], *map(str, words)], capture_output=True, text=True, check=False)
-
-
-def _checked(folder: Path) -> Answer:
-    done = _command("check", folder)
+def _command(*words: object) -> Answer:
+    command = [os.environ["EIGENHEAD"], *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     return done.returncode == 0, f"{done.stdout} {done.stderr}".strip()
 
 
 def _reconstructed(folder: Path, truth: Path | None) -> Answer:
     out = Path(f"{folder}.out")
-    done = _command("reconstruct", folder, "--out", out, "--detail", "span", "--surface", "head")
-    return done.returncode == 0 and (truth is None or _distance_mm(out, truth) < NEAR_MM), done.stderr.strip()
+    done, said = _command("reconstruct", folder, "--out", out, "--detail", "span", "--surface", "head")
+    return done and (truth is None or _distance_mm(out, truth) < NEAR_MM), said
 
 
 def _distance_mm(result: Path, truth: Path) -> float:
@@ -197,7 +200,6 @@ def _uploaded(folder: Path, url: str) -> Answer:
     import common  # type: ignore[import-not-found]
 
     packed = folder if folder.is_file() else common.zipped(folder)
-    words = ["curl", "-sS", "-F", f"file=@{packed}", f"{url}/v1/captures/uploads"]
-    said = json.loads(subprocess.run(words, capture_output=True, text=True, check=False).stdout)
+    said = json.loads(subprocess.check_output(["curl", "-sS", "-F", f"file=@{packed}", f"{url}/v1/captures/uploads"]))
     messages = [*said.get("errors", []), *(warning["message"] for warning in said.get("warnings", []))]
     return "id" in said, "; ".join(map(str, messages))

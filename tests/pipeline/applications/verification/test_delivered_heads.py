@@ -1,12 +1,14 @@
 """Heads come back from result folders as they were before their expression and place, and make a model."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeline.applications.verification.delivered_heads import build_from_results, find_results, read_delivered
+from pipeline.applications.verification.measured import read_report
 from pipeline.head_model.model import load_model
 from rig.errors import InputError
 from rig.formats.meshes.ply import write_ply
@@ -42,6 +44,7 @@ def deliver(folder: Path, seed: int, warnings: tuple[str, ...] = (), model: str 
         "world_from_head": {"scale": 1.0, "rotation": rotation.tolist(), "translation": shift.tolist()},
         "warnings": [{"code": code} for code in warnings],
         "expression": [{"name": name, "weight": weight} for name, weight in SMILE.items()],
+        "inputs": {"images/cam00.png": f"{seed}", "cameras.json": "c"},
     }
     (folder / "report.json").write_text(json.dumps(report))
 
@@ -79,6 +82,12 @@ def test_what_makes_no_model_is_named(tmp_path: Path) -> None:
     deliver(tmp_path / "b", 2, warnings=("pose-doubtful",))
     with pytest.raises(InputError, match=r"1 results can be used, but 3 are needed.*b: warns pose-doubtful"):
         build_from_results(tmp_path, tmp_path / "out.npz", name="out")
+    deliver(tmp_path / "again", 1)
+    with pytest.raises(InputError, match=r"1 results can.*again: .*same photographs as a,"):
+        build_from_results(tmp_path, tmp_path / "out.npz", name="out")
+    with pytest.raises(InputError, match=r"results of 3 captures \(a, again, b\)"):
+        read_report(tmp_path)
+    shutil.rmtree(tmp_path / "again")
     deliver(tmp_path / "c", 3)
     (tmp_path / "c" / "head.ply").write_bytes(b"ply\n")
     with pytest.raises(InputError, match=r"c/?.*head\.ply"):

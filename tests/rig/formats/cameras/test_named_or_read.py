@@ -44,6 +44,15 @@ def test_names_in_capitals_are_read(kind: str, tmp_path: Path) -> None:
     close(read_cameras(find_cameras(place)).rig, fan())
 
 
+def test_cameras_json_is_read_by_its_content_and_a_broken_link_is_named(tmp_path: Path) -> None:
+    write_rig_file(fan(), file := tmp_path / "cameras.json", "metashape")
+    close(read_cameras(find_cameras(tmp_path)).rig, fan())
+    file.unlink()
+    file.symlink_to("elsewhere.json")
+    with pytest.raises(InputError, match=r"a link to a file that is not there: elsewhere\.json"):
+        read_cameras(find_cameras(tmp_path))
+
+
 @pytest.mark.parametrize("encoding", MARKED)
 @pytest.mark.parametrize("kind", FILES)
 def test_encodings_are_told_by_their_marks(kind: str, encoding: str, tmp_path: Path) -> None:

@@ -177,7 +177,7 @@ def test_a_csv_that_a_spreadsheet_saved_with_semicolons_is_read(tmp_path: Path) 
     plain = read_rig_file(path)
     path.write_text("\ufeff" + path.read_text().replace(",", ";").replace(".", ",").replace(",png", ".png"), "utf-8")
     assert find_rig_file(tmp_path) == path
-    saved = read_rig_file(path)
+    saved = read_rig_file(path.rename(tmp_path / "cameras.json"))
     assert saved.names == plain.names
     for one, other in zip(saved, plain, strict=True):
         np.testing.assert_allclose(one.project(POINTS), other.project(POINTS))
