@@ -9,6 +9,7 @@ from rig.messages.message import Message, compose
 from server.errors import Conflict
 from server.services.texts import check_texts
 from server.storage.records import CaptureRecord, JobWebhook
+from server.tasks.film import film_setting_faults
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,11 +24,12 @@ class ReconstructionRequest:
     webhook: JobWebhook | None = None
     deliver_to: str | None = None
 
-    def check(self) -> None:
-        """Raises InputError naming an invalid job name, an unknown model, every wrong setting and a template that the
-        model does not have. The check keeps a job from failing hours later because of such faults."""
+    def check(self, *, film: bool = False) -> None:
+        """Raises InputError naming an invalid job name, an unknown model, every wrong setting (of a ``film`` or a shot)
+        and a template that the model does not have, so that no job fails hours later because of such faults."""
         check_texts({"name": self.name}, "request")
-        model, settings = self._model_faults(), self._settings_faults()
+        settings = film_setting_faults(self.settings or {}) if film else self._settings_faults()
+        model = self._model_faults()
         if model and settings:
             named = (("model", model), ("settings", settings))
             faults = [compose("located", where=name, fault=fault) for name, found in named for fault in found]
@@ -74,3 +76,10 @@ def refuse_board(record: CaptureRecord) -> None:
     """Raises Conflict for a capture of the calibration board, from which no head can be made."""
     if record.board:
         raise Conflict("board-shot", compose("board-shot"))
+
+
+def require_shot(record: CaptureRecord) -> None:
+    """Raises Conflict for a capture that is no single shot of a head: of the calibration board, or a film."""
+    refuse_board(record)
+    if record.frames:
+        raise Conflict("film-capture", compose("film-capture"))

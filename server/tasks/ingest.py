@@ -52,10 +52,12 @@ from rig.progress import Progress
 from rig.rig import Rig
 from server.storage.records import CameraSize, CaptureContent
 from server.tasks.child import WorkerContext
+from server.tasks.film import ingest_film, is_film
 from server.tasks.photographs import (
     CAMERAS,
     FIGURES,
     calibrate_photographs,
+    check_file_bytes,
     check_sizes,
     photographs_alone,
     read_scaled_capture,
@@ -66,7 +68,6 @@ if TYPE_CHECKING:
     from pipeline.settings import Settings
 
 UPLOAD_PIXELS = 64_000_000  # of all pictures whose outlines are checked: 1.3 GB with plates and distances, of 4 GiB
-JSON_BYTES_MOST = 16 << 20  # of cameras.json and its like; 64 cameras with all feature points have .5 MB
 PICTURES_MOST = 16  # of the largest size that one camera may have: picture, mask, eight plates, six texture sets
 Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as features.json has them
 
@@ -74,7 +75,7 @@ Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as fea
 def ingest_archive(
     context: WorkerContext, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
 ) -> CaptureContent:
-    """Unpacks the archive of a capture, checks it, and leaves in ``folder`` exactly the capture's files. Photographs
+    """Unpacks the archive of a capture or film, checks it, and leaves in ``folder`` exactly its files. Photographs
     without cameras are calibrated first.
 
     Returns the content for the capture's record. Raises InputError naming every fault; the folder is then unusable.
@@ -83,6 +84,8 @@ def ingest_archive(
     unpacked = target.with_name(target.name + ".unpacked")
     extract_archive(Path(archive), unpacked, limits)
     root = capture_root(unpacked)
+    if is_film(root):
+        return ingest_film(root, target, image_pixels, report)
     warnings = _calibrate(root, image_pixels, report) if photographs_alone(root) else None
     networks = _face_networks(context)
     described = check_capture(root, image_pixels, report, networks=networks)
@@ -248,9 +251,7 @@ def check_capture(
     ``networks``: look for the subject's face with these. Pictures that belong to no camera are no fault, since a
     reconstruction ignores them with a warning.
     """
-    for path in (entry(root, name) for name in (CAMERAS, FEATURES, SCALE)):
-        if path.is_file() and path.stat().st_size > JSON_BYTES_MOST:
-            raise InputError(path.name, [compose("file-large", most_mib=JSON_BYTES_MOST >> 20)])
+    check_file_bytes(entry(root, name) for name in (CAMERAS, FEATURES, SCALE))
     rigs, read, files, faults = open_capture(root)
     rig_file, rig = rigs[0], read.rig
     digests: dict[str, str] = {}

@@ -43,6 +43,7 @@ from rig.plausibility import rig_faults
 from rig.progress import Progress
 from rig.rig import Rig, spread_views
 
+JSON_BYTES_MOST = 16 << 20  # of cameras.json and its like; 64 cameras with all feature points have .5 MB
 CAMERAS, FIGURES, PAGE, CACHE = "cameras.json", "calibration.json", "calibration.html", ".cache"
 
 
@@ -154,6 +155,13 @@ def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -
         if same and document["cameras_sha256"] == sha256_of(kept / CAMERAS):
             return tuple(map(read_message, document["told"]))
     return None
+
+
+def check_file_bytes(files: Iterable[Path]) -> None:
+    """Raises InputError for a file with more than ``JSON_BYTES_MOST`` bytes; files may be missing."""
+    for path in files:
+        if path.is_file() and path.stat().st_size > JSON_BYTES_MOST:
+            raise InputError(path.name, [compose("file-large", most_mib=JSON_BYTES_MOST >> 20)])
 
 
 def check_sizes(files: Iterable[Path], image_pixels: int) -> None:

@@ -40,5 +40,9 @@ TEMPLATES = {
     "sequence-without-face": "The head was not found in any frame: check that cameras.json belongs to these pictures.",
     "sequence-clock-wrong": "clock.json must state mean_ms for every camera: run eigenhead clock again",
     "sequence-skewed": "The cameras expose {spread_ms:.0f} ms apart; in {count} of {all} frames the face moves by more than {most_mm:.0f} mm in that time. Trigger the cameras together.",
+    "film-capture": "The capture is a film: only a job (POST /v1/jobs) can use it. For one shot, upload the pictures of one frame.",
+    "film-export": "A film has no single head to export: take sequence.glb, or sequence.usdc from a job with the setting usd.",
+    "film-settings": "A film's job has no settings but usd: leave out {names}.",
+    "batch-capture-film": "{capture} is a film, and a batch takes shots only: track it by a job of its own (POST /v1/jobs)",
     "sequence-frames-failed": "{count} of {all} frames failed and were interpolated: {frames}.",
 }

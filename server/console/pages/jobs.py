@@ -116,7 +116,7 @@ def job_detail(service: Service, job_id: str) -> JsonObject:
             "seconds": {} if report is None else report.get("seconds", {}),
             "stopped_because": None if report is None else report.get("stopped_because"),
             "evaluations": None if report is None else report.get("evaluations"),
-            "pictures": report is not None,
+            "pictures": bool(cameras),
         }
 
     return shared.get(("detail", job_id, finished), 3600.0 if finished else 0.4, make)
@@ -137,7 +137,7 @@ def restart(page: Page, event: JsonObject) -> Message:
     wanted = ReconstructionRequest(event.get("model") or None, chosen_settings(event))
     job = page.service.jobs.restart(event["id"], wanted, key=page.caller.key)
     page.choice["job"] = job.id
-    page.started(job.id, opens=True)
+    page.started(job.id, opens=job.frames is None)
     return compose("job-queued", job=job.id[-6:])
 
 
