@@ -1,11 +1,7 @@
 """Films in the service: a few small frames of a head in the studio, uploaded, tracked by a job, and erased."""
 
 import io
-import json
-import os
-import signal
-import tarfile
-from collections.abc import Iterator
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +9,9 @@ import httpx
 import numpy as np
 import pytest
 
+from pipeline.applications.moments.footage import open_footage
 from pipeline.head_model.model import load_model
-from rig.formats.captures.archive import pack_folder
+from rig.errors import InputError
 from rig.formats.pictures.work_size import work_rig
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
@@ -26,10 +23,11 @@ from tests.support.services import (
     await_state,
     await_true,
     awaited,
-    running_service,
+    kill_workers,
+    packed,
+    served_client,
     stored,
     upload,
-    worker_pids,
 )
 from tests.support.small_studio import CLEAN
 
@@ -46,11 +44,6 @@ def filmed(folder: Path, frames: int, renderer: Renderer) -> Path:
     return folder
 
 
-def packed_film(folder: Path) -> bytes:
-    pack_folder(folder, folder.with_suffix(".tar"))
-    return folder.with_suffix(".tar").read_bytes()
-
-
 @pytest.fixture(scope="module")
 def film(renderer: Renderer, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return filmed(tmp_path_factory.mktemp("film") / "anna", 3, renderer)
@@ -59,7 +52,7 @@ def film(renderer: Renderer, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def stored_film(http: httpx.Client, film: Path) -> str:
     """The id of the film in the service."""
-    return upload(http, packed_film(film), label="Anna speaks").json()["id"]
+    return upload(http, packed(film), label="Anna speaks").json()["id"]
 
 
 def test_a_film_is_uploaded_tracked_and_erased(
@@ -68,7 +61,12 @@ def test_a_film_is_uploaded_tracked_and_erased(
     record = http.get(f"/v1/captures/{stored_film}").json()
     assert (record["kind"], record["frames"], record["verdict"], record["board"]) == ("film", 3, None, False)
     assert [camera["name"] for camera in record["cameras"]] == CAMERAS
-    assert record["inputs"].keys() >= {"cameras.json", "times.csv", "images/cam07/00002.png", "background/cam00/000.png"}
+    assert record["inputs"].keys() >= {
+        "cameras.json",
+        "times.csv",
+        "images/cam07/00002.png",
+        "background/cam00/000.png",
+    }
     picture = http.get(f"/v1/captures/{stored_film}/images/cam07")
     assert picture.headers["etag"].strip('"') == record["inputs"]["images/cam07/00000.png"]
 
@@ -88,9 +86,68 @@ def test_a_film_is_uploaded_tracked_and_erased(
     assert http.get(f"/v1/jobs/{job['id']}/result/report.json").json()["frames"] == 3
     assert not [name for name in stored(service) if CHUNKS in name]
     exported = http.post(f"/v1/jobs/{job['id']}/exports", json={"as": "obj"})
-    assert exported.status_code == 422, exported.text
-    print(exported.text)
+    assert (exported.status_code, exported.json()["detail_message"]["code"]) == (409, "film-export")
 
     assert http.delete(f"/v1/captures/{stored_film}", params={"erase": True}).status_code == 204
     assert http.get(f"/v1/jobs/{job['id']}").status_code == 404
     assert not [name for name in stored(service) if stored_film in name or job["id"] in name]
+
+
+def test_a_film_with_faults_is_refused_in_the_words_of_the_command(
+    http: httpx.Client, film: Path, tmp_path: Path
+) -> None:
+    spoilt = shutil.copytree(film, tmp_path / "anna")
+    shutil.rmtree(spoilt / "images" / "cam07")
+    for name in CAMERAS[:-1]:
+        for number in (1, 2):
+            (spoilt / "images" / name / f"{number:05}.png").rename(spoilt / "images" / name / f"{number}{name}.png")
+    with pytest.raises(InputError) as told:
+        open_footage(spoilt)
+    refused = upload(http, packed(spoilt))
+    assert (refused.status_code, refused.json()["type"]) == (422, "urn:eigenhead:problem:invalid-capture")
+    assert refused.json()["errors"] == [fault.text for fault in told.value.faults]
+    assert len(refused.json()["errors"]) == 1
+
+
+def test_what_takes_single_shots_refuses_a_film_by_name(http: httpx.Client, stored_film: str) -> None:
+    def code(path: str, document: dict, status: int, method: str = "POST") -> list[str]:
+        answer = http.request(method, path, json=document)
+        assert answer.status_code == status, answer.text
+        said = answer.json()
+        return [each["code"] for each in said["error_messages"]] or [said["detail_message"]["code"]]
+
+    points = {"format": "eigenhead-features/1", "points": {}}
+    assert code(f"/v1/captures/{stored_film}/features", points, 409, "PUT") == ["film-capture"]
+    assert code("/v1/batches", {"captures": [stored_film]}, 422) == ["batch-capture-film"]
+    wanted = {"capture_id": stored_film, "settings": {"detail": "fine", "usd": 1}}
+    assert code("/v1/jobs", wanted, 422) == ["film-settings", "no-switch"]
+    assert http.get("/v1/captures", params={"q": "Anna speaks"}).json()["captures"][0]["kind"] == "film"
+    session = http.post("/v1/sessions", json={"label": "Anna"}).json()["id"]
+    assert http.patch(f"/v1/captures/{stored_film}", json={"session": session}).status_code == 200
+    assert http.post(f"/v1/sessions/{session}/jobs", json={}).json()["jobs"] == []
+
+
+@pytest.mark.slow
+def test_a_films_job_goes_on_from_its_chunks_when_its_worker_is_killed(tmp_path: Path, renderer: Renderer) -> None:
+    film = filmed(tmp_path / "anna", 30, renderer)
+    with served_client(tmp_path / "data", silent_s="2") as (service, http):
+        capture = upload(http, packed(film)).json()["id"]
+        job = http.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
+        chunk = service.data / "jobs" / job / CHUNKS / "0000000.npz"
+        await_true(chunk.is_file, 1200.0)
+        written = chunk.stat().st_mtime_ns
+        kill_workers(service)
+        again = awaited(lambda: http.get(f"/v1/jobs/{job}").json(), lambda found: found["frames_done"], 600.0)
+        assert (again["state"], chunk.stat().st_mtime_ns) == ("running", written)
+        assert 25 <= again["frames_done"] < 30
+        done = await_state(http, job, ("succeeded", "failed"), 600.0)
+        assert sorted(done["files"]) == RESULT, done
+        with np.load(io.BytesIO(http.get(f"/v1/jobs/{job}/result/sequence.npz").content)) as found:
+            assert found["frames"].tolist() == [f"{number:05}" for number in range(30)]
+            assert not found["failed"].any()
+
+        restarted = http.post(f"/v1/jobs/{job}/restart").json()["id"]
+        folder = service.data / "jobs" / restarted
+        await_true((folder / CHUNKS).is_dir, 600.0)
+        http.post(f"/v1/jobs/{restarted}/cancel")
+        await_true(lambda: not (folder / CHUNKS).exists())
