@@ -147,7 +147,6 @@ def _calibrate_board(
     from calibration.calibrate import calibrate as run
     from calibration.report import report_page
     from calibration.result import CalibrationRefused
-    from rig.files import write_atomically
     from rig.formats.cameras.cameras_json import read_rig, write_rig
 
     known = None if previous is None else read_rig(previous)
@@ -177,7 +176,6 @@ def _calibrate_scene(
 ) -> None:
     from calibration.scene.result import scene_page
     from calibration.scene.scene import calibrate_scene
-    from rig.files import write_atomically
     from rig.formats.cameras.cameras_json import write_rig
 
     page = out.with_suffix(".html")
@@ -217,7 +215,6 @@ def refine(
     warn_of_replacement(out, overwrite)
     prepare_file(out)
     from calibration.silhouette_refinement.report import refinement_page
-    from rig.files import write_atomically
     from rig.formats.cameras.cameras_json import write_rig
     from server.tasks.refine import refine_locally
 

@@ -49,7 +49,7 @@ from server.services.captures import picture_name
 from server.services.keys import Caller
 from server.services.service import Service
 from server.services.truth import surface_distance
-from server.services.work import require_shot
+from server.services.work import check_kind
 from server.storage.face_cache import faces_once
 from server.storage.records import CaptureRecord, JsonObject
 from server.tasks.child import WorkerContext
@@ -461,7 +461,7 @@ def found_faces(service: Service, identity: str) -> JsonObject:
     """
     deadline = time.monotonic() + PATIENCE_S
     record = service.store.capture(identity)
-    require_shot(record)
+    check_kind(record)
     images = {Path(name).stem: name for name in record.inputs if Path(name).parent.name == "images"}
     files = service.store.capture_files(identity)
 

@@ -25,7 +25,7 @@ from server.services.jobs import Jobs
 from server.services.records import moment_now
 from server.services.rigs import SHOT_BYTES, RigBackend, SimulatedRig
 from server.services.texts import check_texts, checked_tags, typed_tags
-from server.services.work import require_shot
+from server.services.work import check_kind
 from server.settings import ServiceSettings
 from server.storage.folders import folder_bytes
 from server.storage.library import CaptureQuery, Library
@@ -214,7 +214,7 @@ class Captures:
         """Checks feature points (pixels, by point and camera) against the cameras of a shot and stores them in place of
         earlier points. Raises NotFound, Conflict for the calibration board and for a film, and InputError naming every
         point that does not fit."""
-        require_shot(self._store.capture(identity))
+        check_kind(self._store.capture(identity))
         folder = self._store.capture_files(identity)
         try:
             with self._children.one() as child:
@@ -251,7 +251,7 @@ class Captures:
         of_capture = self._jobs.find(capture=identity, limit=100_000)
         here = folder_bytes(self._store.folder("captures", identity))  # the store may hold more
         return HoldingsOut(
-            pictures=record.pictures,
+            pictures=len(record.cameras) * max(record.frames, 1),
             bytes=max(record.bytes, here) + folder_bytes(self._store.cache_of(identity)),
             heads=[job.id for job in of_capture if job.state == "succeeded"],
             head_bytes=sum(file.bytes for job in of_capture for file in job.files.values()),

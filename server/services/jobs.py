@@ -38,7 +38,7 @@ from server.services.job_rows import (
 from server.services.records import DeliveryOut, JobOut
 from server.services.results import Results
 from server.services.webhooks import messages_of
-from server.services.work import ReconstructionRequest, refuse_board
+from server.services.work import ReconstructionRequest, check_kind
 from server.settings import ServiceSettings
 from server.storage.batches import BatchIndex, BatchRow
 from server.storage.database import alive_workers, portions, workers
@@ -293,7 +293,7 @@ class Jobs(JobQueries):
         API key has too many jobs.
         """
         capture = self._store.capture(capture_id)
-        refuse_board(capture)
+        check_kind(capture, film=True)
         wanted.check(film=capture.frames > 0)
         self.check_queue(queue)
         self._store.reserve(0, self._settings.free_bytes)

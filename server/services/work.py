@@ -72,14 +72,9 @@ def _template_faults(name: str, model: str) -> list[Message]:
     return []
 
 
-def refuse_board(record: CaptureRecord) -> None:
-    """Raises Conflict for a capture of the calibration board, from which no head can be made."""
+def check_kind(record: CaptureRecord, *, film: bool = False) -> None:
+    """Raises Conflict for a capture of the calibration board and, without ``film``, for a film."""
     if record.board:
         raise Conflict("board-shot", compose("board-shot"))
-
-
-def require_shot(record: CaptureRecord) -> None:
-    """Raises Conflict for a capture that is no single shot of a head: of the calibration board, or a film."""
-    refuse_board(record)
-    if record.frames:
+    if record.frames and not film:
         raise Conflict("film-capture", compose("film-capture"))

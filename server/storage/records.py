@@ -107,11 +107,6 @@ class CaptureRecord:
         """Returns what the pictures are: one shot of a head, of the calibration board, or a film of a head."""
         return "board" if self.board else "film" if self.frames else "shot"
 
-    @property
-    def pictures(self) -> int:
-        """Returns how many pictures the cameras took, plates and masks apart."""
-        return len(self.cameras) * max(self.frames, 1)
-
 
 @dataclass(frozen=True, slots=True)
 class SessionRecord:

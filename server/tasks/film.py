@@ -21,7 +21,7 @@ from rig.progress import Progress
 from server.processes import share_one_heap
 from server.storage.records import CameraSize, CaptureContent, EventDocument
 from server.tasks.child import WorkerContext
-from server.tasks.photographs import check_file_bytes
+from server.tasks.photographs import CAMERAS, JSON_BYTES_MOST
 from server.tasks.progress import Clock, JobProgress
 
 if TYPE_CHECKING:
@@ -49,7 +49,9 @@ def ingest_film(root: Path, target: Path, image_pixels: int, report: Progress) -
     Raises InputError naming every fault."""
     from pipeline.applications.moments.footage import CLOCK, TIMES, open_footage
 
-    check_file_bytes(root / name for name in ("cameras.json", CLOCK, TIMES))
+    for path in (root / CAMERAS, root / CLOCK, root / TIMES):
+        if path.is_file() and path.stat().st_size > JSON_BYTES_MOST:
+            raise InputError(path.name, [compose("file-large", most_mib=JSON_BYTES_MOST >> 20)])
     try:
         footage = open_footage(root)
     except InputError as error:

@@ -18,7 +18,7 @@ from pipeline.alignment.feature_checks import feature_faults, unknown_landmarks
 from pipeline.faces.matching import EYE_DISTANCE_MM
 from pipeline.faces.networks import DamagedNetwork, FaceNetworks, load_networks
 from pipeline.faces.sighting import GLANCE, GLANCE_PX, SMALLEST_PX, reduce_picture, sight_face
-from pipeline.faces.subject import find_subject
+from pipeline.faces.subject import SearchEffort, find_subject
 from pipeline.view_checks.one_moment import judge_moments
 from pipeline.warnings import ReportWarning
 from rig.acquisition.face_sighting import FaceSighting
@@ -56,8 +56,8 @@ from server.tasks.film import ingest_film, is_film
 from server.tasks.photographs import (
     CAMERAS,
     FIGURES,
+    JSON_BYTES_MOST,
     calibrate_photographs,
-    check_file_bytes,
     check_sizes,
     photographs_alone,
     read_scaled_capture,
@@ -135,13 +135,11 @@ def check_views(
 ) -> tuple[ReportWarning, ...]:
     """Returns findings of outlines and faces on a capture's pictures and cameras, and all remarks on its files; faces
     are searched only with ``networks``. Raises the errors of the checks."""
-    from pipeline.faces.subject import SearchEffort, find_subject
     from pipeline.segmentation.segment import segment
     from pipeline.settings import OutputSettings
     from pipeline.texturing.chart_colours import chart_colours
     from pipeline.view_checks.guards import Guards
     from pipeline.view_checks.lens_distortion import judge_distortion
-    from pipeline.view_checks.one_moment import judge_moments
     from pipeline.view_checks.usable_views import usable_views
     from server.tasks.prepare import prepare_kernels
 
@@ -251,7 +249,9 @@ def check_capture(
     ``networks``: look for the subject's face with these. Pictures that belong to no camera are no fault, since a
     reconstruction ignores them with a warning.
     """
-    check_file_bytes(entry(root, name) for name in (CAMERAS, FEATURES, SCALE))
+    for path in (entry(root, name) for name in (CAMERAS, FEATURES, SCALE)):
+        if path.is_file() and path.stat().st_size > JSON_BYTES_MOST:
+            raise InputError(path.name, [compose("file-large", most_mib=JSON_BYTES_MOST >> 20)])
     rigs, read, files, faults = open_capture(root)
     rig_file, rig = rigs[0], read.rig
     digests: dict[str, str] = {}

@@ -157,13 +157,6 @@ def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -
     return None
 
 
-def check_file_bytes(files: Iterable[Path]) -> None:
-    """Raises InputError for a file with more than ``JSON_BYTES_MOST`` bytes; files may be missing."""
-    for path in files:
-        if path.is_file() and path.stat().st_size > JSON_BYTES_MOST:
-            raise InputError(path.name, [compose("file-large", most_mib=JSON_BYTES_MOST >> 20)])
-
-
 def check_sizes(files: Iterable[Path], image_pixels: int) -> None:
     """Raises InputError naming every picture with more than ``image_pixels`` pixels. Sizes are read from the files'
     headers, before anything is decoded."""

@@ -58,10 +58,10 @@ def make_sequence(
     folder: Path, out: Path, *, model: str, settings: Settings, report: Progress, usd: bool = False,
     share: tuple[int, int] = (1, 1), kept: Path | None = None,
 ) -> dict[str, Any] | None:  # fmt: skip
-    """Tracks the head of a sequence and writes the ``FILES`` into ``out``; with ``usd``, also sequence.usdc. The
-    folder ``kept``, by default ``CHUNKS`` in ``out``, stores chunks. Returns the content of report.json. With a ``share`` (k, n) the function tracks part k of n of the frames, and returns None
-    while frames of other shares are missing. Raises InputError for an invalid folder, every error of ``reconstruct``,
-    UnknownModel or BadModel, NoUsd, and OSError."""
+    """Tracks the head of a sequence and writes the ``FILES`` into ``out``; with ``usd``, also sequence.usdc. The folder
+    ``kept`` stores chunks (None: ``CHUNKS`` in ``out``). Returns the content of report.json. With a ``share`` (k, n)
+    the function tracks part k of n of the frames, and returns None while frames of other shares are missing. Raises
+    InputError for an invalid folder, every error of ``reconstruct``, UnknownModel or BadModel, NoUsd, and OSError."""
     if usd:
         check_usd()
     footage, head_model, kept = open_footage(folder), load_model(model), kept or out / CHUNKS

@@ -265,10 +265,10 @@ def discard(page: Page, event: JsonObject) -> None:
     Conflict while a queued or running job needs the capture."""
     service, identity = page.service, event["id"]
     record = service.captures.check_unused(identity)
-    heads = len(service.captures.holdings(identity).heads)
-    title = compose("capture-pictures", pictures=record.pictures, name=record.label or identity[-6:])
-    if heads:
-        title = compose("heads-stay", thing=title, count=heads)
+    held = service.captures.holdings(identity)
+    title = compose("capture-pictures", pictures=held.pictures, name=record.label or identity[-6:])
+    if held.heads:
+        title = compose("heads-stay", thing=title, count=len(held.heads))
     remove_later(identity, lambda: service.captures.remove(identity), title, "capture")
 
 

@@ -1,11 +1,9 @@
 """Implements the page Jobs: queue, progress, log, cancel, restart with other settings, and figures of a job."""
 
-import json
 from collections.abc import Callable, Mapping
 from typing import cast, get_args
 
 from pipeline.head_model.model_names import list_models
-from rig.errors import InputError
 from rig.messages.message import Message, compose
 from server.console.page import (
     Action,
@@ -29,6 +27,7 @@ from server.services.work import ReconstructionRequest
 from server.storage.events import JobEvent
 from server.storage.job_index import JobOrder, JobQuery
 from server.storage.records import JsonObject
+from server.tasks.settings_file import settings_of_text
 
 SHOWN = 50  # jobs of a page, and of those that wait before them
 SOUGHT_MOST = 1000  # queued jobs among which a search looks for the next ones
@@ -144,12 +143,7 @@ def restart(page: Page, event: JsonObject) -> Message:
 def chosen_settings(event: JsonObject) -> Mapping[str, object]:
     """Reads the settings of a form: method, detail, front, and further ones from the JSON text ``more``. Raises
     InputError if ``more`` is no JSON object."""
-    try:
-        settings = json.loads(event.get("more") or "{}")
-    except ValueError as error:
-        raise InputError("settings", [compose("further-settings-no-json", reason=str(error))]) from error
-    if not isinstance(settings, dict):
-        raise InputError("settings", [compose("further-settings-no-object")])
+    settings = settings_of_text(event.get("more") or "{}")
     return settings | {key: event.get(key) for key in ("method", "detail", "front") if event.get(key)}
 
 

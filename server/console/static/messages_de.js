@@ -248,8 +248,6 @@ export default {
   "points-suggested": "{count} Stelle vorgeschlagen. Ansehen, dann übernehmen. | {count} Stellen vorgeschlagen. Jede ansehen, dann übernehmen.",
   "features-saved": "Gespeichert. Aufträge verwenden von jetzt an diese Punkte.",
   "job-queued": "Auftrag {job} ist eingereiht.",
-  "further-settings-no-json": "die weiteren Einstellungen sind kein JSON ({reason})",
-  "further-settings-no-object": "die weiteren Einstellungen sind kein JSON-Objekt wie {\"fitting\": {\"modes\": 80}}",
   "jobs-active": "Diese Aufträge warten oder laufen; erst abbrechen.",
   "jobs-with-heads": "{count} Aufträge mit ihren Köpfen",
   "jobs-removed-count": "{count} entfernt.",
