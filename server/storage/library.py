@@ -120,8 +120,7 @@ class Library:
             return [*connection.scalars(query)]
 
     def boards_among(self, captures: Collection[str]) -> dict[str, bool]:
-        """Returns for each of the captures whether it is of the calibration board or a film. Ids of no capture are left
-        out."""
+        """Returns for each of the captures whether it is no shot of a head. Ids of no capture are left out."""
         table, found = capture_index.c, dict[str, bool]()
         with self._engine.connect() as connection:
             for some in portions(captures):

@@ -8,6 +8,7 @@ import json
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
@@ -196,8 +197,6 @@ def _of_file(mask: Bool[np.ndarray, "h w"], k: Intrinsics) -> UInt8[np.ndarray, 
 
 def _made_of(root: Path, front: str | None) -> dict[str, str]:
     """Returns the SHA-256 of every input of a calibration."""
-    from importlib.metadata import version
-
     files = [path for path in sorted(picture_folder(root).rglob("*")) if is_picture(path)]
     files += [path for path in sorted(entry(root, "masks").glob("*")) if is_picture(path)]
     files += [path for path in (entry(root, SCALE),) if path.is_file()]

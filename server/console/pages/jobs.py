@@ -106,7 +106,7 @@ def job_detail(service: Service, job_id: str) -> JsonObject:
     def make() -> JsonObject:
         events = service.jobs.events.since(job_id, 0, limit=10_000)
         report = read_report(service, job_id) if finished else None
-        cameras = {} if report is None else report.get("cameras", {})
+        cameras = {} if report is None or "frames" in report else report.get("cameras", {})  # a film has no figures
         return {
             "id": job_id,
             "log": log_lines(events)[-LOG_LINES:],

@@ -127,9 +127,7 @@ def read_report(service: Service, job_id: str) -> Report | None:
     path = service.store.folder("jobs", job_id) / "result" / "report.json"
 
     def read() -> Report | None:
-        report = json.loads(path.read_text()) if path.is_file() else None
-        of_film = report is not None and "frames" in report  # which has no figures of one head
-        return cast(Report, {"warnings": report["warnings"]} if of_film else report)
+        return cast(Report, json.loads(path.read_text())) if path.is_file() else None
 
     return shared.get(("report", job_id), 3600.0, read)
 
