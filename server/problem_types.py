@@ -11,8 +11,8 @@ URN = "urn:eigenhead:problem:"
 REFUSED = """
 batch-active batch-ended board-shot calibration-active calibration-poor camera-missing capture-in-use
 capture-missing changed-since consent-missing data-unwritable database-unavailable deliveries-off delivery-active
-delivery-failed disk-full file-damaged first-key foreign-origin idempotency-conflict import-failed imports-off
-internal-error job-active key-invalid key-missing no-board no-capture no-result no-parquet none-failed
+delivery-failed disk-full file-damaged film-capture first-key foreign-origin idempotency-conflict import-failed
+imports-off internal-error job-active key-invalid key-missing no-board no-capture no-result no-parquet none-failed
 not-calibrated not-found object-missing other-board other-rig own-key plates-failed plates-occupied result-missing
 rig-unavailable scope-missing shot-failed simulated-rig some-refused still-writing store-denied store-unavailable
 too-few-shots too-late too-many-checks too-many-uploads too-many-batches too-many-jobs upload-busy upload-too-large

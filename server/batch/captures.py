@@ -7,7 +7,6 @@ later run whether its result is up to date."""
 
 import csv
 import hashlib
-import json
 import os
 import re
 from collections import Counter
@@ -23,7 +22,7 @@ from rig.formats.captures.shot_files import ASIDE, listed_pictures
 from rig.formats.pictures.picture_names import entry, is_junk
 from rig.messages.message import Message, compose
 from rig.text import suggest
-from server.tasks.settings_file import read_settings_file, reason_of
+from server.tasks.settings_file import read_settings_file, reason_of, settings_of_text
 
 ARCHIVES = (".tar.gz", ".tgz", ".tar", ".zip")
 COLUMNS = ("capture", "name", "subject", "session", "settings")
@@ -192,12 +191,7 @@ def _capture_of(row: Mapping[str, str], folder: Path, faults: list[Message]) -> 
 
 def _settings_of(text: str, folder: Path) -> dict[str, object]:
     """Reads the settings in a cell: a JSON object, or the path of a JSON or TOML file."""
-    if not text.startswith("{"):
-        return read_settings_file(folder / text)
-    try:
-        return dict(json.loads(text))
-    except (ValueError, RecursionError) as error:
-        raise InputError("settings", [compose("settings-unreadable", reason=str(error))]) from error
+    return settings_of_text(text) if text.startswith("{") else read_settings_file(folder / text)
 
 
 def _name_faults(captures: list[BatchCapture], places: list[str]) -> list[Message]:

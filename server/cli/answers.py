@@ -19,7 +19,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from pipeline.head_model.model_names import DATA
+from pipeline.head_model.model_names import DATA, list_models
 from rig.errors import EigenheadError, InputError
 from rig.messages.message import compose, texts_of
 from rig.progress import Progress
@@ -143,8 +143,6 @@ def number(help_text: str, **limits: Any) -> Any:
 
 def model_names() -> tuple[str, ...]:
     """Returns the names of all installed head models."""
-    from pipeline.head_model.model_names import list_models
-
     return tuple(list_models())
 
 

@@ -1,6 +1,7 @@
 """Implements the commands of calibration: board, calibrate, refine, convert."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -111,8 +112,6 @@ def calibrate(
 def _calibrate_lenses(images: Path, board: Path, out: Path, json_out: bool) -> None:
     """Writes each camera's lens in the keys of cameras.json, without a pose, with the standard deviations of fx fy cx
     cy (px) k1 k2 p1 p2 k3."""
-    from dataclasses import asdict
-
     from calibration.adjustment.intrinsics import estimate_lenses
     from calibration.board.board import read_board
     from calibration.board.detection import detect_folder

@@ -27,6 +27,7 @@ from server.cli.answers import (
     warn,
     warn_of_replacement,
 )
+from server.tasks.settings_file import settings_document
 
 if TYPE_CHECKING:
     from pipeline.applications.verification.judgement import Limits
@@ -144,7 +145,6 @@ def reconstruct(
 ) -> None:
     """Reconstruct one capture without the service."""
     from server.cli.reconstruct_local import flame_lines, reconstruct_locally
-    from server.tasks.settings_file import settings_document
 
     requested = {"normal_map": normal_map, "neutral": neutral, "morphs": morphs, "slicer": slicer, "surface": surface}
     requested |= {"template": template, "formats": formats and formats.split(","), "albedo": "file" if albedo else None}
@@ -176,7 +176,6 @@ def check(
 
     Status 2 where it cannot be reconstructed; with warnings it can, and the status is 0."""
     from server.cli.check import checked, lines
-    from server.tasks.settings_file import settings_document
 
     with progress_bar() as report:
         document = settings_document(settings, strict=strict, texture={"chart": True} if chart else None)
@@ -209,7 +208,6 @@ def verify(
     """Judge a rig by a mannequin of known shape.
 
     Status 1 where a limit is missed."""
-    from server.tasks.settings_file import settings_document
 
     wanted, chosen = read_limits(limits), settings_document(settings)
     warn_of_replacement(out / "report.json", overwrite)
@@ -310,7 +308,6 @@ def read_limits(path: Path | None) -> "Limits":
     default values. Raises InputError."""
     from pipeline.applications.verification.judgement import Limits
     from rig.typed_tables import read_table
-    from server.tasks.settings_file import settings_document
 
     return read_table(Limits, settings_document(path), path.name if path else "limits")
 

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from pipeline.head_model.model_names import PACK_FILES, list_models, models_folder, remove_model
 from server.cli.answers import Data, Json, Overwrite, answer, prepare_file, progress_bar, switch, warn_of_replacement
 
 model_app = typer.Typer(help="Head models.", no_args_is_help=True, rich_markup_mode=None)
@@ -13,8 +14,6 @@ model_app = typer.Typer(help="Head models.", no_args_is_help=True, rich_markup_m
 @model_app.command("list", epilog="Example: eigenhead model list")
 def model_list(data: Data = None, json_out: Json = False) -> None:
     """List the head models at hand."""
-    from pipeline.head_model.model_names import list_models
-
     models = {name: str(path) for name, path in list_models().items()}
     answer({"models": models}, json_out, [f"{name}  {path}" for name, path in models.items()])
 
@@ -54,7 +53,6 @@ def model_import(
     """
     from pipeline.applications.model_building.sources.imports import import_model
     from pipeline.head_model.model_file import save_model
-    from pipeline.head_model.model_names import PACK_FILES, models_folder
 
     if name is not None and (Path(name).name != name or name in PACK_FILES):
         raise typer.BadParameter(f"{name!r}: a name without folders that no shipped model has", param_hint="--name")
@@ -159,7 +157,5 @@ def model_remove(
     """Remove a head model.
 
     One that was imported or fetched; the shipped one stays."""
-    from pipeline.head_model.model_names import remove_model
-
     path = remove_model(name)
     answer({"name": name, "file": str(path)}, json_out, [f"removed {path}"])

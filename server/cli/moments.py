@@ -97,14 +97,13 @@ def sequence(
     from pipeline.applications.moments.sequence_files import CACHE, FILES, make_sequence
     from pipeline.settings import settings_from_document
     from server.batch.captures import WHOLE, read_shard
-    from server.cli.heads import head_alone
     from server.cli.reconstruct_local import check_apart
+    from server.tasks.film import SETTINGS
     from server.tasks.prepare import prepare_kernels
-    from server.tasks.settings_file import settings_document
 
     with wrong_usage("--shard"):
         part = WHOLE if shard is None else read_shard(shard)
-    chosen = settings_from_document(head_alone(settings_document(None, detail="photo")))
+    chosen = settings_from_document(SETTINGS)
     check_apart(out, folder)
     prepare_folder(out)
     with progress_bar() as report:

@@ -1,5 +1,6 @@
 """Implements the commands that run and maintain the service: serve, worker, prepare, doctor, keys."""
 
+import platform
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -61,8 +62,6 @@ def worker(
 
 def _worker_lives(settings: "ServiceSettings") -> bool:
     """Returns whether a worker of this host is alive; True if the database, whose loss workers survive, is away."""
-    import platform
-
     import sqlalchemy as sa
 
     from server.storage.database import DatabaseUnavailable, alive_workers, open_database, workers

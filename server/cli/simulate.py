@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.studio.sensor.faults import KINDS
+from rig.studio.sensor.faults import KINDS, fault_from_text
 from server.cli.answers import Json, Overwrite, Overwrites, answer, number, prepare_folder, progress_bar, wrong_usage
 from server.cli.moments import film_sequence
 
@@ -131,8 +131,6 @@ def _studio_preset(realism: str | None, **chosen: Any) -> "Preset":
 
 def _check_planted(faults: list[str], expression: list[str]) -> None:
     """Raises typer.BadParameter for faults or expressions that are unknown."""
-    from rig.studio.sensor.faults import fault_from_text
-
     with wrong_usage("--fault"):
         for text in faults:
             fault_from_text(text)

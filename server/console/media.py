@@ -45,10 +45,11 @@ from server.console.identity import caller_of, permit, service_of_pages
 from server.console.live import LiveView
 from server.console.page import as_problem
 from server.errors import NotFound, Unavailable
+from server.services.captures import picture_name
 from server.services.keys import Caller
 from server.services.service import Service
 from server.services.truth import measure_distance
-from server.services.work import refuse_board
+from server.services.work import check_kind
 from server.storage.face_cache import faces_once
 from server.storage.records import CaptureRecord, JsonObject
 from server.tasks.child import WorkerContext
@@ -114,8 +115,8 @@ def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
     """Returns a small JPEG file of an image of a capture. The browser may cache it for ever, because pictures of a
     capture never change."""
     service = who[0]
-    name = _image_name(service.store.capture(capture_id), camera)
-    path = service.store.cache_of(capture_id) / "small" / f"{Path(name).stem}.jpg"
+    name = picture_name(service.store.capture(capture_id), "images", camera)
+    path = service.store.cache_of(capture_id) / "small" / f"{camera}.jpg"
     if not path.is_file():
         make_thumbnail(service.store.capture_files(capture_id) / name, path)
     return FileResponse(path, headers=FOREVER)
@@ -150,7 +151,7 @@ def silhouette(who: Reader, capture_id: str, camera: str) -> Response:
     """Returns the outline of the subject in a camera's picture. The first request for a capture draws the outlines of
     all its cameras."""
     service = who[0]
-    name = Path(_image_name(service.store.capture(capture_id), camera)).stem
+    name = Path(picture_name(service.store.capture(capture_id), "images", camera)).stem
     folder = service.store.cache_of(capture_id) / "outlines"
     with _drawing:
         if not (folder / f"{name}.png").is_file():
@@ -236,7 +237,7 @@ def photograph(who: Reader, job_id: str, camera: str) -> Response:
     """Returns a photograph of the job's capture without lens distortion, which the first request makes and caches."""
     service = who[0]
     capture, record = _capture_files(service, job_id)
-    name = _image_name(record, camera)
+    name = picture_name(record, "images", camera)
     stored = service.store.cache_of(record.id) / "straightened" / f"{Path(name).stem}.jpg"
     if not stored.is_file():
         picture = straighten(read_image(capture / name), rig_of(capture)[camera])
@@ -329,13 +330,6 @@ def make_thumbnail(source: Path, target: Path) -> None:
         picture.thumbnail((THUMBNAIL_WIDTH, THUMBNAIL_WIDTH * 2), reducing_gap=2.0)
         picture.save(unfinished, "JPEG", quality=THUMBNAIL_QUALITY)
     unfinished.rename(target)
-
-
-def _image_name(record: CaptureRecord, camera: str) -> str:
-    for name in record.inputs:
-        if Path(name).parent.name == "images" and Path(name).stem == camera:
-            return name
-    raise NotFound(compose("thing-camera"), camera)
 
 
 def _capture_files(service: Service, job_id: str) -> tuple[Path, CaptureRecord]:
@@ -462,12 +456,12 @@ def moved_onto(mine: Mesh, theirs: Mesh) -> Float[np.ndarray, "v 3"]:
 def found_faces(service: Service, identity: str) -> JsonObject:
     """Returns the faces in a capture's pictures. The first call detects the faces; later calls read the cache. Blocks.
 
-    Raises NotFound, Conflict for a shot of the calibration board, InputError and WorkFailed if the pictures cannot be
+    Raises NotFound, Conflict for a film and the calibration board, InputError and WorkFailed if the pictures cannot be
     searched, and Unavailable after ``PATIENCE_S`` seconds.
     """
     deadline = time.monotonic() + PATIENCE_S
     record = service.store.capture(identity)
-    refuse_board(record)
+    check_kind(record)
     images = {Path(name).stem: name for name in record.inputs if Path(name).parent.name == "images"}
     files = service.store.capture_files(identity)
 

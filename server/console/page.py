@@ -336,7 +336,7 @@ def followed_jobs(service: Service, ids: Sequence[str]) -> list[JsonObject]:
     def make() -> list[JsonObject]:
         known = {job.id: job for job in service.jobs.of(ids)}
         return [
-            {"id": i, "state": known[i].state, "progress": round(known[i].progress, 2)}
+            {"id": i, "state": known[i].state, "progress": round(known[i].progress, 2), "frames": known[i].frames}
             if i in known
             else {"id": i, "state": "gone", "progress": 0.0}
             for i in ids

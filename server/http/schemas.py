@@ -13,7 +13,7 @@ from rig.acquisition.verdict import Verdict
 from server.services.answer import Answer, JobSettings, MessageOut, Moment, Said, as_data
 from server.services.records import CalibrationOut, FileOut, JobOut, PersonOut, SessionOut
 from server.services.texts import PLAIN, TAG_MOST, TAGS_MOST, TEXT_MOST
-from server.storage.records import JsonObject, ViewChecksOut
+from server.storage.records import CaptureKind, JsonObject, ViewChecksOut
 
 Id = Annotated[str, Field(pattern="^[0-9a-f]{28}$", description="28 hex digits")]
 Text = Annotated[str, Field(max_length=TEXT_MOST, pattern=PLAIN)]
@@ -207,12 +207,14 @@ class CaptureOut(Answer):
     cameras: list[Size]
     front: str
     features: bool
+    kind: CaptureKind = Field(description="board: of the calibration board, cannot be reconstructed; film: is tracked")
+    frames: int = Field(0, description="of a film; 0: one shot")
     board: bool = Field(False, description="pictures of the calibration board, which cannot be reconstructed")
     bytes: int
     inputs: dict[str, str] = Field(description="sha256 of every file, by name")
     shot: JsonObject | None = Field(None, description="the rig's sync certificate")
     verdict: Verdict | None = Field(
-        None, description="good: no fault; poor: shoot again; null: not judged (of the board, or of an earlier version)"
+        None, description="good: no fault; poor: shoot again; null: not judged (board, film, earlier version)"
     )
     faults: list[FaultOut] = Field(default_factory=list, description="every fault that the verdict follows from")
     warnings: list[WarningOut] = Field(

@@ -249,6 +249,8 @@ class Batches:
                 faults.append(compose("batch-capture-repeated", capture=capture, times=times))
             if capture not in boards:
                 faults.append(compose("batch-capture-unknown", capture=capture))
+            elif boards[capture] and self._store.capture(capture).frames:
+                faults.append(compose("batch-capture-film", capture=capture))
             elif boards[capture]:
                 faults.append(compose("batch-capture-board", capture=capture))
         return faults

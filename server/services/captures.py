@@ -25,7 +25,7 @@ from server.services.jobs import Jobs
 from server.services.records import moment_now
 from server.services.rigs import SHOT_BYTES, RigBackend, SimulatedRig
 from server.services.texts import check_texts, checked_tags, typed_tags
-from server.services.work import refuse_board
+from server.services.work import check_kind
 from server.settings import ServiceSettings
 from server.storage.folders import folder_bytes
 from server.storage.library import CaptureQuery, Library
@@ -196,12 +196,8 @@ class Captures:
         """Returns a camera's picture of one kind ("images", "background"). The path comes from the capture's record,
         never from the request. Raises NotFound."""
         record = self._store.capture(identity)
-        for name, digest in record.inputs.items():
-            path = Path(name)
-            single = path.parent.name == kind and path.stem == camera
-            if single or (kind == "background" and path.parent.name == camera and path.parent.parent.name == kind):
-                return StoredFile(self._store.capture_files(identity) / name, digest)
-        raise NotFound(compose("thing-camera-file"), camera, compose("hint-capture-inputs"))
+        name = picture_name(record, kind, camera)
+        return StoredFile(self._store.capture_files(identity) / name, record.inputs[name])
 
     def features(self, identity: str) -> Points:
         """Returns the stored feature points of a capture, in pixels, by point and camera. Returns an empty mapping if
@@ -215,10 +211,10 @@ class Captures:
             raise NotFound(compose("thing-feature-points"), identity, compose("hint-put-again")) from error
 
     def put_features(self, identity: str, points: Points) -> CaptureRecord:
-        """Checks feature points (pixels, by point and camera) against the capture's cameras and stores them in place of
-        earlier points. Raises NotFound, Conflict for a capture of the calibration board, and InputError naming every
+        """Checks feature points (pixels, by point and camera) against the cameras of a shot and stores them in place of
+        earlier points. Raises NotFound, Conflict for the calibration board and for a film, and InputError naming every
         point that does not fit."""
-        refuse_board(self._store.capture(identity))
+        check_kind(self._store.capture(identity))
         folder = self._store.capture_files(identity)
         try:
             with self._children.one() as child:
@@ -255,7 +251,7 @@ class Captures:
         of_capture = self._jobs.find(capture=identity, limit=100_000)
         here = folder_bytes(self._store.folder("captures", identity))  # the store may hold more
         return HoldingsOut(
-            pictures=len(record.cameras),
+            pictures=len(record.cameras) * max(record.frames, 1),
             bytes=max(record.bytes, here) + folder_bytes(self._store.cache_of(identity)),
             heads=[job.id for job in of_capture if job.state == "succeeded"],
             head_bytes=sum(file.bytes for job in of_capture for file in job.files.values()),
@@ -311,9 +307,12 @@ class Captures:
             inputs=content.inputs,
             bytes=content.bytes,
             board=content.board,
+            frames=content.frames,
             features="features.json" in content.inputs,
             shot=shot,
-            verdict=None if content.board else verdict_of(faults, [camera.name for camera in content.cameras]),
+            verdict=None
+            if content.board or content.frames
+            else verdict_of(faults, [camera.name for camera in content.cameras]),
             faults=faults,
             warnings=(*content.warnings, *face_remarks(content.face, faults)),
             tags=about.tags,
@@ -326,3 +325,14 @@ class Captures:
             self._store.remove_capture(record.id, later=True)
             raise
         return record
+
+
+def picture_name(record: CaptureRecord, kind: str, camera: str) -> str:
+    """Returns the name of a camera's picture of one kind ("images", "background"), the first one of several. Raises
+    NotFound."""
+    for name in record.inputs:
+        path = Path(name)
+        single = path.parent.name == kind and path.stem == camera
+        if single or (path.parent.name == camera and path.parent.parent.name == kind):
+            return name
+    raise NotFound(compose("thing-camera-file"), camera, compose("hint-capture-inputs"))

@@ -38,7 +38,7 @@ from server.services.job_rows import (
 from server.services.records import DeliveryOut, JobOut
 from server.services.results import Results
 from server.services.webhooks import messages_of
-from server.services.work import ReconstructionRequest, refuse_board
+from server.services.work import ReconstructionRequest, check_kind
 from server.settings import ServiceSettings
 from server.storage.batches import BatchIndex, BatchRow
 from server.storage.database import alive_workers, portions, workers
@@ -241,6 +241,7 @@ class JobQueries:
         state = STATES[row.status]
         progress: EventDocument = event.document if event is not None and state == "running" else {}
         request = request_of(row)
+        frames = None if request is None else request.get("frames")
         here = state == "succeeded" and self.results.objects is None
         lost = here and not self._result(row.workflow_id).is_dir()
         return JobOut(
@@ -250,6 +251,8 @@ class JobQueries:
             stage=progress.get("stage") or ("done" if state == "succeeded" else state),
             progress=1.0 if state == "succeeded" else progress.get("progress", 0.0),
             eta_s=progress.get("eta_s"),
+            frames=frames,
+            frames_done=frames if state == "succeeded" else progress.get("frames_done"),
             error=failure(row) if state == "failed" else None,
             notice=idle[row.queue_name] if state == "queued" else compose("result-missing") if lost else None,
             capture_id=None if request is None else request["capture_id"],
@@ -281,20 +284,22 @@ class Jobs(JobQueries):
         queue: str | None = None,
         priority: int = 100,
     ) -> JobOut:
-        """Queues a reconstruction of a capture and returns the job. A repeated request with the same idempotency key
-        returns the job of the first request.
+        """Queues a reconstruction of a shot, or the tracking of a film, and returns the job. A repeated request with
+        the same idempotency key returns the job of the first request.
 
         Raises NotFound for an unknown capture; InputError for an unknown model, wrong settings or queue; InvalidInput
         for a webhook that may not be called and for a place where results may not be delivered; Conflict for a capture
         of the calibration board and for an idempotency key that was used for another request; DiskFull; TooMany if the
         API key has too many jobs.
         """
-        wanted.check()
         capture = self._store.capture(capture_id)
-        refuse_board(capture)
+        check_kind(capture, film=True)
+        wanted.check(film=capture.frames > 0)
         self.check_queue(queue)
         self._store.reserve(0, self._settings.free_bytes)
         request: JobRequest = {"capture_id": capture_id, "model": wanted.model, "settings": wanted.settings or {}}
+        if capture.frames:
+            request["frames"] = capture.frames
         if wanted.name:
             request["name"] = wanted.name
         if wanted.webhook is not None:
@@ -376,11 +381,11 @@ class Jobs(JobQueries):
         """Queues a new job for the capture of an earlier job, and records the earlier job's id in it. Model and
         settings that are None in ``wanted`` are the earlier job's. Raises InputError for a wrong model or settings,
         NotFound if the job or its capture is gone, and TooMany."""
-        wanted.check()
         row = self._known(job_id)
         request = request_of(row)
         if request is None:
             raise NotFound(compose("thing-job-request"), job_id)
+        wanted.check(film="frames" in request)
         request = cast(JobRequest, {**request, "restart_of": job_id})
         if wanted.settings is not None:
             request["settings"] = wanted.settings

@@ -49,6 +49,8 @@ class JobOut(Answer):
     stage: str
     progress: float = Field(ge=0, le=1)
     eta_s: float | None
+    frames: int | None = Field(None, description="of a film")
+    frames_done: int | None = Field(None, description="of a film that is or was tracked")
     error: JobError | None
     notice: Said | None = Field(None, description="why a queued job cannot begin or a result is gone; what to do")
     notice_message = as_data("notice", MessageOut | None)

@@ -128,8 +128,10 @@ class Service:
 
     def export(self, job_id: str, outputs: Mapping[str, object]) -> bytes:
         """Returns a .zip with the files of a finished head that the settings ``outputs`` name. Raises NotFound,
-        Conflict for a job without result, InputError for settings that are not allowed, and DiskFull."""
+        Conflict for a job without result or of a film, InputError for settings that are not allowed, and DiskFull."""
         folder, job = self.jobs.result_folder(job_id), self.jobs.get(job_id)
+        if job.frames:
+            raise Conflict("film-capture", compose("film-export"))
         ReconstructionRequest(job.model, {"outputs": outputs}).check()
         with self.store.incoming() as scratch, self.children.one() as child:
             archive = scratch / "export.zip"

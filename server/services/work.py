@@ -9,6 +9,7 @@ from rig.messages.message import Message, compose
 from server.errors import Conflict
 from server.services.texts import check_texts
 from server.storage.records import CaptureRecord, JobWebhook
+from server.tasks.film import film_setting_faults
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,11 +24,12 @@ class ReconstructionRequest:
     webhook: JobWebhook | None = None
     deliver_to: str | None = None
 
-    def check(self) -> None:
-        """Raises InputError naming an invalid job name, an unknown model, every wrong setting and a template that the
-        model does not have. The check keeps a job from failing hours later because of such faults."""
+    def check(self, *, film: bool = False) -> None:
+        """Raises InputError naming an invalid job name, an unknown model, every wrong setting (of a ``film`` or a shot)
+        and a template that the model does not have, so that no job fails hours later because of such faults."""
         check_texts({"name": self.name}, "request")
-        model, settings = self._model_faults(), self._settings_faults()
+        settings = film_setting_faults(self.settings or {}) if film else self._settings_faults()
+        model = self._model_faults()
         if model and settings:
             named = (("model", model), ("settings", settings))
             faults = [compose("located", where=name, fault=fault) for name, found in named for fault in found]
@@ -70,7 +72,9 @@ def _template_faults(name: str, model: str) -> list[Message]:
     return []
 
 
-def refuse_board(record: CaptureRecord) -> None:
-    """Raises Conflict for a capture of the calibration board, from which no head can be made."""
+def check_kind(record: CaptureRecord, *, film: bool = False) -> None:
+    """Raises Conflict for a capture of the calibration board and, without ``film``, for a film."""
     if record.board:
         raise Conflict("board-shot", compose("board-shot"))
+    if record.frames and not film:
+        raise Conflict("film-capture", compose("film-capture"))

@@ -113,14 +113,14 @@ class Library:
         return found
 
     def heads_of(self, session: str) -> list[str]:
-        """Lists the ids of the captures of a session that show a head, newest first."""
+        """Lists the ids of the captures of a session that are shots of a head, newest first."""
         table = capture_index.c
         query = sa.select(table.id).where(table.session == session, table.board.is_(False)).order_by(table.id.desc())
         with self._engine.connect() as connection:
             return [*connection.scalars(query)]
 
     def boards_among(self, captures: Collection[str]) -> dict[str, bool]:
-        """Returns for each of the captures whether it shows the calibration board. Ids of no capture are left out."""
+        """Returns for each of the captures whether it is no shot of a head. Ids of no capture are left out."""
         table, found = capture_index.c, dict[str, bool]()
         with self._engine.connect() as connection:
             for some in portions(captures):
@@ -129,7 +129,7 @@ class Library:
         return found
 
     def heads_labelled(self, prefix: str) -> list[str]:
-        """Lists the ids of the captures that show a head and whose label begins with ``prefix``, oldest first. Upper
+        """Lists the ids of the shots of a head whose label begins with ``prefix``, oldest first. Upper
         and lower case letters of a label count as the same."""
         table, begun = capture_index.c, folded(prefix)
         query = sa.select(table.id, table.label).where(
@@ -275,7 +275,7 @@ def _row_of(record: Record, changed: int) -> dict[str, object]:
         "session": None if record.session is None else storable(record.session),
         "verdict": record.verdict or UNJUDGED,
         "source": record.source,
-        "board": record.board,
+        "board": record.kind != "shot",
         "bytes": record.bytes,
         "words": words,
     }

@@ -6,7 +6,7 @@ jobs stay mappings, since the job engine keeps them unchanged across upgrades of
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Generic, NotRequired, TypedDict, TypeVar
+from typing import Annotated, Any, Generic, Literal, NotRequired, TypedDict, TypeVar
 
 from pydantic import BaseModel, Field, PlainSerializer, PlainValidator, TypeAdapter
 
@@ -16,6 +16,7 @@ from rig.acquisition.verdict import ViewDocument
 from rig.messages.message import Message, read_message
 
 JsonObject = dict[str, Any]  # what HTTP takes and gives without a shape of its own
+CaptureKind = Literal["shot", "board", "film"]
 T = TypeVar("T")
 
 
@@ -55,8 +56,9 @@ class CaptureContent:
     """Holds the content of a capture's folder.
 
     ``inputs``: SHA-256 of every file; ``board``: whether the pictures show the calibration board and no head;
-    ``checks``: measurements of each camera's picture; ``warnings``: those of the calibration, if the cameras were found
-    from the photographs; ``face``: findings on the subject's face (None if no search was made).
+    ``frames``: those of a film, 0 for a shot; ``checks``: measurements of each camera's picture; ``warnings``: those of
+    the calibration, if the cameras were found from the photographs; ``face``: findings on the subject's face (None if
+    no search was made).
     """
 
     cameras: tuple[CameraSize, ...]
@@ -64,6 +66,7 @@ class CaptureContent:
     inputs: dict[str, str]
     bytes: int
     board: bool = False
+    frames: int = 0
     faults: tuple[StoredFault, ...] = ()
     checks: Mapping[str, ViewDocument] = field(default_factory=dict)
     warnings: tuple[StoredMessage, ...] = ()
@@ -75,9 +78,9 @@ class CaptureRecord:
     """Holds a capture: its source, people's notes on it, its content, the certificate of its shot, and the verdict on
     it.
 
-    ``verdict``: None if the capture was not judged (the board, captures of earlier versions); ``faults``: the reasons
-    for the verdict; ``warnings``: those of the calibration and remarks on the face; ``inputs``: SHA-256 of every file
-    by name.
+    ``frames``: those of a film, 0 for a shot; ``verdict``: None if the capture was not judged (the board, films,
+    captures of earlier versions); ``faults``: the reasons for the verdict; ``warnings``: those of the calibration and
+    remarks on the face; ``inputs``: SHA-256 of every file by name.
     """
 
     id: str
@@ -93,10 +96,16 @@ class CaptureRecord:
     features: bool
     shot: Mapping[str, object] | None = None
     board: bool = False
+    frames: int = 0
     verdict: str | None = None
     faults: tuple[StoredFault, ...] = ()
     warnings: tuple[StoredMessage, ...] = ()
     tags: tuple[str, ...] = ()
+
+    @property
+    def kind(self) -> CaptureKind:
+        """Returns what the pictures are: one shot of a head, of the calibration board, or a film of a head."""
+        return "board" if self.board else "film" if self.frames else "shot"
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +214,7 @@ class JobWebhook(TypedDict):
 
 
 class JobRequest(TypedDict):
-    """Holds the request for a job, as the job engine stores it."""
+    """Holds the request for a job, as the job engine stores it. ``frames``: of the film that it tracks."""
 
     capture_id: str
     model: str | None
@@ -214,6 +223,7 @@ class JobRequest(TypedDict):
     name: NotRequired[str]
     webhook: NotRequired[JobWebhook]
     deliver_to: NotRequired[str]
+    frames: NotRequired[int]
 
 
 class DeliveryRequest(TypedDict):
@@ -248,10 +258,13 @@ class WebhookMessage(TypedDict):
 
 class EventDocument(TypedDict, total=False):
     """Holds one event of a job: its stage, with progress (0 to 1) and remaining time (s) of the whole job, or a new
-    state. ``camera_moved``: cameras that no longer have their calibrated poses."""
+    state. ``camera_moved``: cameras that no longer have their calibrated poses; ``frames``: of a film, and how many of
+    them are done."""
 
     state: str
     stage: str
     progress: float
     eta_s: float | None
     camera_moved: list[str]
+    frames: int
+    frames_done: int

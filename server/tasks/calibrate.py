@@ -12,6 +12,8 @@ from typing import Any
 
 from rig.errors import InputError
 from rig.files import sha256_of, write_atomically
+from rig.formats.cameras.cameras_json import read_rig, write_rig
+from rig.formats.cameras.scale_json import read_scale
 from rig.formats.captures.archive import ArchiveLimits, extract_archive
 from rig.formats.captures.capture_folder import capture_root
 from rig.messages.message import compose, documents_of, texts_of
@@ -32,9 +34,8 @@ def expected(folder: Path) -> dict[str, float]:
     """Estimates the seconds of each stage of a calibration from the number of pictures, before it begins. Larger
     pictures take longer than this estimate."""
     pictures = sum(path.is_file() for path in (folder / "images").rglob("*"))
-    if not is_of_board(folder):
-        return {stage: took * pictures for stage, took in SCENE_STAGES_S.items()}
-    return {stage: took * pictures for stage, took in STAGES_S.items()}
+    stages = STAGES_S if is_of_board(folder) else SCENE_STAGES_S
+    return {stage: took * pictures for stage, took in stages.items()}
 
 
 def is_of_board(folder: Path) -> bool:
@@ -99,8 +100,6 @@ def forget_scene(folder: Path) -> None:
 
 def check_scale(folder: Path) -> None:
     """Raises InputError for a scale.json that does not fit the photographs beside it. Does nothing without one."""
-    from rig.formats.cameras.scale_json import read_scale
-
     if (folder / SCALE).is_file():
         read_scale(folder / SCALE, [path.name for path in (folder / "images").iterdir()])
 
@@ -128,7 +127,6 @@ def calibrate_folder(
     from calibration.calibrate import calibrate
     from calibration.report import report_page
     from calibration.result import CalibrationRefused
-    from rig.formats.cameras.cameras_json import read_rig, write_rig
 
     known = None if previous is None else read_rig(Path(previous))
     try:
@@ -151,7 +149,6 @@ def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | 
     from calibration.result import CalibrationRefused
     from calibration.scene.result import judge_scene, scene_page
     from calibration.scene.scene import calibrate_scene
-    from rig.formats.cameras.cameras_json import write_rig
 
     scale = folder / SCALE
     try:

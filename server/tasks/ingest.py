@@ -18,7 +18,7 @@ from pipeline.alignment.feature_checks import feature_faults, unknown_landmarks
 from pipeline.faces.matching import EYE_DISTANCE_MM
 from pipeline.faces.networks import DamagedNetwork, FaceNetworks, load_networks
 from pipeline.faces.sighting import GLANCE, GLANCE_PX, SMALLEST_PX, reduce_picture, sight_face
-from pipeline.faces.subject import find_subject
+from pipeline.faces.subject import SearchEffort, find_subject
 from pipeline.view_checks.one_moment import judge_moments
 from pipeline.warnings import ReportWarning
 from rig.acquisition.face_sighting import FaceSighting
@@ -52,9 +52,11 @@ from rig.progress import Progress
 from rig.rig import Rig
 from server.storage.records import CameraSize, CaptureContent
 from server.tasks.child import WorkerContext
+from server.tasks.film import ingest_film, is_film
 from server.tasks.photographs import (
     CAMERAS,
     FIGURES,
+    JSON_BYTES_MOST,
     calibrate_photographs,
     check_sizes,
     photographs_alone,
@@ -66,7 +68,6 @@ if TYPE_CHECKING:
     from pipeline.settings import Settings
 
 UPLOAD_PIXELS = 64_000_000  # of all pictures whose outlines are checked: 1.3 GB with plates and distances, of 4 GiB
-JSON_BYTES_MOST = 16 << 20  # of cameras.json and its like; 64 cameras with all feature points have .5 MB
 PICTURES_MOST = 16  # of the largest size that one camera may have: picture, mask, eight plates, six texture sets
 Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as features.json has them
 
@@ -74,7 +75,7 @@ Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as fea
 def ingest_archive(
     context: WorkerContext, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
 ) -> CaptureContent:
-    """Unpacks the archive of a capture, checks it, and leaves in ``folder`` exactly the capture's files. Photographs
+    """Unpacks the archive of a capture or film, checks it, and leaves in ``folder`` exactly its files. Photographs
     without cameras are calibrated first.
 
     Returns the content for the capture's record. Raises InputError naming every fault; the folder is then unusable.
@@ -83,6 +84,8 @@ def ingest_archive(
     unpacked = target.with_name(target.name + ".unpacked")
     extract_archive(Path(archive), unpacked, limits)
     root = capture_root(unpacked)
+    if is_film(root):
+        return ingest_film(root, target, image_pixels, report)
     warnings = _calibrate(root, image_pixels, report) if photographs_alone(root) else None
     networks = _face_networks(context)
     described = check_capture(root, image_pixels, report, networks=networks)
@@ -132,13 +135,11 @@ def check_views(
 ) -> tuple[ReportWarning, ...]:
     """Returns findings of outlines and faces on a capture's pictures and cameras, and all remarks on its files; faces
     are searched only with ``networks``. Raises the errors of the checks."""
-    from pipeline.faces.subject import SearchEffort, find_subject
     from pipeline.segmentation.segment import segment
     from pipeline.settings import OutputSettings
     from pipeline.texturing.chart_colours import measure_charts
     from pipeline.view_checks.guards import Guards
     from pipeline.view_checks.lens_distortion import judge_distortion
-    from pipeline.view_checks.one_moment import judge_moments
     from pipeline.view_checks.usable_views import usable_views
     from server.tasks.prepare import prepare_kernels
 

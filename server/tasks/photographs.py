@@ -8,6 +8,7 @@ import json
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
@@ -43,6 +44,7 @@ from rig.plausibility import rig_faults
 from rig.progress import Progress
 from rig.rig import Rig, spread_views
 
+JSON_BYTES_MOST = 16 << 20  # of cameras.json and its like; 64 cameras with all feature points have .5 MB
 CAMERAS, FIGURES, PAGE, CACHE = "cameras.json", "calibration.json", "calibration.html", ".cache"
 
 
@@ -193,8 +195,6 @@ def _of_file(mask: Bool[np.ndarray, "h w"], k: Intrinsics) -> UInt8[np.ndarray, 
 
 def _made_of(root: Path, front: str | None) -> dict[str, str]:
     """Returns the SHA-256 of every input of a calibration."""
-    from importlib.metadata import version
-
     files = [path for path in sorted(picture_folder(root).rglob("*")) if is_picture(path)]
     files += [path for path in sorted(entry(root, "masks").glob("*")) if is_picture(path)]
     files += [path for path in (entry(root, SCALE),) if path.is_file()]

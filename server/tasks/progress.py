@@ -47,6 +47,10 @@ class JobProgress:
             self._expected.setdefault(self._visit, 0.0)
         self._fraction = min(1.0, max(0.0, fraction))
 
+    def counts(self) -> "EventDocument":
+        """Returns what an event states besides stage, progress and remaining time."""
+        return {}
+
     def finish(self) -> dict[str, float]:
         """Ends the last stage and returns the seconds that each stage took."""
         self._close()
@@ -127,5 +131,6 @@ class ProgressMeter:
         self._last = (stage, now)
         share, left_s = round(self._progress.progress(), 4), round(self._progress.remaining_s(), 1)
         event: EventDocument = {"state": "running", "stage": stage, "progress": share, "eta_s": left_s}
+        event |= self._progress.counts()
         seq = self._log.append(self._job_id, event, self._superseded)
         self._superseded = None if begins else seq

@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.settings import Settings, settings_from_document
 from rig.formats.captures.archive import extract_archive
 from rig.messages.message import compose
 from rig.progress import Progress
@@ -21,7 +22,6 @@ from server.processes import end_with_parent, share_one_heap, tidied
 from server.tasks.child import WorkerContext
 
 if TYPE_CHECKING:
-    from pipeline.settings import Settings
     from pipeline.stages.context import Segment
     from pipeline.warnings import ReportWarning
     from rig.render.compute import ComputeDevice
@@ -51,7 +51,6 @@ def reconstruct_capture(
     """
     report("read", 0.0)  # a fresh child loads for seconds what this takes
     share_one_heap()
-    from pipeline.settings import settings_from_document
     from server.storage.silhouette_cache import segment_once
     from server.tasks.photographs import Prepared, calibration_warnings, read_scaled_capture
 
@@ -89,7 +88,7 @@ def reconstruct_folder(
     out: Path,
     kept: Path,
     model: str | None,
-    chosen: "Settings",
+    chosen: Settings,
     preparation: Progress,
 ) -> None:
     """Reconstructs the capture in ``folder`` and writes the result to ``out``. Cameras and masks that had to be
@@ -131,7 +130,6 @@ def reconstruct_beside(
     ends with the process ``parent``. All temporary files lie in the folder ``scratch``."""
     end_with_parent(parent)
     share_one_heap()
-    from pipeline.settings import settings_from_document
 
     os.environ["TMPDIR"] = tempfile.tempdir = scratch
     chosen, out = settings_from_document(settings), Path(result)
@@ -149,7 +147,7 @@ def run_job(
     *,
     folders: tuple[Path, Path],
     model: str | None,
-    chosen: "Settings",
+    chosen: Settings,
     segment: "Segment",
     preparation: Progress,
 ) -> None:
@@ -206,7 +204,7 @@ MOST_THREADS = 8  # of a processor that a GPU is faster than: of an H200 two thr
 # longer
 
 
-def matching_device(context: WorkerContext, chosen: "Settings", renderer: "Renderer") -> "ComputeDevice | None":
+def matching_device(context: WorkerContext, chosen: Settings, renderer: "Renderer") -> "ComputeDevice | None":
     """Opens the compute device that ``chosen.device`` names, once in each process. Returns None if the CPU compares
     photographs: with the device ``cpu``, and with ``auto`` if there is no GPU or more than ``MOST_THREADS`` threads.
     Raises ComputeUnavailable if ``gl`` was chosen and is missing."""

@@ -24,6 +24,17 @@ def read_settings_file(path: Path) -> dict[str, object]:
     return document
 
 
+def settings_of_text(text: str) -> dict[str, object]:
+    """Reads settings from a JSON text. Raises InputError if it is no JSON object."""
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError("settings", [compose("no-json-because", reason=str(error))]) from error
+    if not isinstance(document, dict):
+        raise InputError("settings", [compose("settings-no-json-object")])
+    return document
+
+
 def reason_of(error: OSError | ValueError | RecursionError) -> str:
     """Returns the reason why a file cannot be read, without the file's path."""
     return getattr(error, "strerror", None) or str(error)

@@ -60,6 +60,7 @@ from server.storage.records import EventDocument, FileEntry, JobRequest, JobWebh
 from server.storage.store import Store
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
 from server.tasks.child import ChildProcessPool, WorkerContext, WorkFailed, function_at
+from server.tasks.film import CHUNKS, FilmProgress, track_film
 from server.tasks.progress import EVERY_S, JobProgress, ProgressMeter
 from server.tasks.reconstruct import reconstruct_capture
 from server.tasks.stage_durations import StageDurations, megapixels_of
@@ -229,7 +230,9 @@ class Worker:
             shutil.rmtree(folder, ignore_errors=True)
             if isinstance(error, Cancelled):
                 log.info("job cancelled")  # here: the engine ends a cancelled workflow before its own handlers run
-            raise failure_of(error) from error
+            if isinstance(failed := failure_of(error), JobFailed | Cancelled):  # no attempt follows
+                shutil.rmtree(folder.with_name(CHUNKS), ignore_errors=True)
+            raise failed from error
         return name
 
     def _fit_in_memory(self, job_id: str, request: JobRequest, folder: Path) -> None:
@@ -256,10 +259,11 @@ class Worker:
         raise JobFailed("out-of-memory", compose("killed-for-memory", count=len(tries), gb=gb))
 
     def _run_work(self, job_id: str, request: JobRequest, folder: Path, settings: Mapping[str, object]) -> None:
-        chosen = settings_from_document(settings)
+        frames = request.get("frames")
+        chosen = settings_from_document({} if frames else settings)
         with self._captures.files(job_id, request["capture_id"]) as files, self._children.one() as child:
             megapixels = megapixels_of(files)
-            progress = JobProgress(self._durations.of(chosen, megapixels))
+            progress = FilmProgress(frames) if frames else JobProgress(self._durations.of(chosen, megapixels))
             meter = ProgressMeter(self.events, job_id, progress, max(EVERY_S, self.settings.poll_s))
 
             def cancelled() -> bool:
@@ -267,14 +271,14 @@ class Worker:
                 return not self._states.runs(job_id)
 
             meter.report("read", 0.0)  # a fresh child loads for seconds before it says so itself
-            child.remote(self._work, report=meter.report, cancelled=cancelled)(
+            child.remote(track_film if frames else self._work, report=meter.report, cancelled=cancelled)(
                 capture=str(files),
                 result=str(folder),
                 cache=str(self.store.cache_of(request["capture_id"])),
                 model=request.get("model"),
                 settings={**settings},
             )
-        if self._work is reconstruct_capture:  # how long another work takes says nothing of this one
+        if self._work is reconstruct_capture and not frames:  # how long another work takes says nothing of this one
             self._durations.learn(chosen, progress.finish(), megapixels)
 
     def calibrate(self, identity: str) -> JsonObject:
@@ -313,8 +317,8 @@ class Worker:
         return result
 
     def publish(self, job_id: str, attempt: str) -> dict[str, FileEntry]:
-        """Renames the folder of an attempt to ``result`` and removes other attempts. Returns size and SHA-256 of every
-        file by name.
+        """Renames the folder of an attempt to ``result`` and removes what other attempts left. Returns size and SHA-256
+        of every file by name.
 
         If another worker has published a result of the job already, that result stays; its files have the same bytes.
         """
@@ -326,7 +330,7 @@ class Worker:
             except OSError as error:
                 if not target.is_dir():
                     raise failure_of(error) from error
-        for old in folder.glob("attempt-*"):
+        for old in (*folder.glob("attempt-*"), folder / CHUNKS):
             shutil.rmtree(old, ignore_errors=True)
         files = described(target)
         self.results.keep(job_id, files, lambda: self._states.runs(job_id), partial(pause, self._stop))

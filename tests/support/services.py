@@ -200,10 +200,8 @@ def packed_capture(folder: Path, seed: int = 0) -> Path:
 
 def uploaded_capture(service: RunningService, folder: Path, seed: int = 0) -> str:
     """The id that the service gave to a small capture, labelled with its seed."""
-    files = {"file": packed_capture(folder, seed).read_bytes()}
-    answer = httpx.post(
-        service.url + "/v1/captures/uploads", files=files, data={"label": f"subject {seed}"}, timeout=60
-    )
+    with httpx.Client(base_url=service.url, timeout=60) as http:
+        answer = upload(http, packed_capture(folder, seed).read_bytes(), label=f"subject {seed}")
     assert answer.status_code == 201, answer.text
     return answer.json()["id"]
 

@@ -23,6 +23,7 @@ DEFINITION = re.compile(r"^ *(?:async )?def ", re.MULTILINE)
 SOLVER_ROOMS = ("pipeline.estimation.", "pipeline.geometry.registration")
 MOMENTS = (
     *("pipeline.applications.moments", "server.cli.moments", "server.services.live", "server.tasks.moving_subject"),
+    *("server.tasks.film", "tests.server.tasks.test_film", "tests.server.http.test_films"),
     *("rig.messages.english.live", "server.http.routes.live", "tests.laboratory.experiments.moments"),
     *("tests.pipeline.applications.moments", "tests.server.services.live"),
 )  # new ground, counted apart: what the ceilings hold has none of it

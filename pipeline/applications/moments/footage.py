@@ -156,6 +156,12 @@ def open_footage(folder: Path) -> Footage:
     return Footage(folder, rig, work_rig(rig, TRACKED_PIXELS), frames, times, files, videos, spread)
 
 
+def video_size(path: Path) -> tuple[int, int]:
+    """Returns the width and height (px) of a video. Raises InputError if it cannot be decoded."""
+    with _opened(path) as reel:
+        return int(reel.get(cv2.CAP_PROP_FRAME_WIDTH)), int(reel.get(cv2.CAP_PROP_FRAME_HEIGHT))
+
+
 def _spread(path: Path, rig: Rig) -> float:
     """Returns how much later (s) the last camera exposes than the first, from clock.json. Raises InputError."""
     if not path.is_file():

@@ -56,15 +56,15 @@ CLAY, LIGHT = np.array([198.0, 176.0, 158.0]), np.array([-0.35, 0.45, 0.82])  # 
 
 def make_sequence(
     folder: Path, out: Path, *, model: str, settings: Settings, report: Progress, usd: bool = False,
-    share: tuple[int, int] = (1, 1),
+    share: tuple[int, int] = (1, 1), kept: Path | None = None,
 ) -> dict[str, Any] | None:  # fmt: skip
-    """Tracks the head of a sequence and writes the ``FILES`` into ``out``; with ``usd``, also sequence.usdc. Returns
-    the content of report.json. With a ``share`` (k, n) the function tracks part k of n of the frames, and returns None
-    while frames of other shares are missing. Raises InputError for an invalid folder, every error of ``reconstruct``,
-    UnknownModel or BadModel, NoUsd, and OSError."""
+    """Tracks the head of a sequence and writes the ``FILES`` into ``out``; with ``usd``, also sequence.usdc. The folder
+    ``kept`` stores chunks (None: ``CHUNKS`` in ``out``). Returns the content of report.json. With a ``share`` (k, n)
+    the function tracks part k of n of the frames, and returns None while frames of other shares are missing. Raises
+    InputError for an invalid folder, every error of ``reconstruct``, UnknownModel or BadModel, NoUsd, and OSError."""
     if usd:
         check_usd()
-    footage, head_model, kept = open_footage(folder), load_model(model), out / CHUNKS
+    footage, head_model, kept = open_footage(folder), load_model(model), kept or out / CHUNKS
     with Renderer.create() as renderer:
         person, course = track_sequence(
             footage, head_model, settings, kept, renderer=renderer, report=report, share=share

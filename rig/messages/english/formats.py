@@ -127,7 +127,6 @@ TEMPLATES = {
     "picture-and-others": "{picture} and {others} other cameras",
     "picture-gone": "{camera}: there is no picture any more",
     "no-picture-folder": "the path is no folder; wanted IMAGES/<camera>/<shot>.png (or jpg, tif, webp)",
-    "no-clock": "{camera} shows the clock in no picture: its row must be whole, sharp and 200 px wide",
     "camera-with-double-shot": "{camera} has two pictures of one shot",
     "no-pictures": "the folder holds no pictures; wanted IMAGES/<camera>/<shot>.png (or jpg, tif, webp)",
     "board-filed-by-shot": "the folders of board pictures are shots, and the files in them are cameras (IMAGES/<shot>/<camera>): they were read in that way",

@@ -35,7 +35,6 @@ TEMPLATES = {
     "thing-job-log": "log of the job",
     "thing-job-request": "request of the job",
     "thing-rig-camera": "camera of the rig",
-    "thing-camera": "camera",
     "thing-plates-version": "version of the clean plates",
     "thing-surface": "surface of the result",
     "thing-truth": "truth of the capture",

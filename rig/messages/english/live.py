@@ -1,4 +1,4 @@
-"""Messages of the live head, which tell the subject or name a camera, and messages of sequences."""
+"""Messages of the live head, which tell the subject or name a camera, and of films, takes and clocks."""
 
 TEMPLATES = {
     "live-starting": "looking for a head ...",
@@ -40,5 +40,13 @@ TEMPLATES = {
     "sequence-without-face": "The head was not found in any frame: check that cameras.json belongs to these pictures.",
     "sequence-clock-wrong": "clock.json must state mean_ms for every camera: run eigenhead clock again",
     "sequence-skewed": "The cameras expose {spread_ms:.0f} ms apart; in {count} of {all} frames the face moves by more than {most_mm:.0f} mm in that time. Trigger the cameras together.",
+    "film-capture": "The capture is a film: only a job (POST /v1/jobs) can use it. For one shot, upload the pictures of one frame.",
+    "film-export": "A film has no single head to export: take sequence.glb, or sequence.usdc from a job with the setting usd.",
+    "film-settings": "A film's job has no settings but usd: leave out {names}.",
+    "batch-capture-film": "{capture} is a film, and a batch takes shots only: track it by a job of its own (POST /v1/jobs)",
     "sequence-frames-failed": "{count} of {all} frames failed and were interpolated: {frames}.",
+    "no-clock": "{camera} shows the clock in no picture: its row must be whole, sharp and 200 px wide",
+    "take-too-small": "{count} capture was given, but a take needs at least two captures of one person: name more folders. | {count} captures were given, but a take needs at least two captures of one person: name more folders.",
+    "take-needs-contour": "A take can be solved only by the method contour: remove the method simplex from the settings.",
+    "take-other-person": "The head of {moment} differs from the common head by {sigmas:.1f} standard deviations: if it is another person, remove it.",
 }

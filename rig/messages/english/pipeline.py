@@ -1,9 +1,6 @@
 """Sentences of pipeline."""
 
 TEMPLATES = {
-    "take-too-small": "{count} capture was given, but a take needs at least two captures of one person: name more folders. | {count} captures were given, but a take needs at least two captures of one person: name more folders.",
-    "take-needs-contour": "A take can be solved only by the method contour: remove the method simplex from the settings.",
-    "take-other-person": "The head of {moment} differs from the common head by {sigmas:.1f} standard deviations: if it is another person, remove it.",
     "no-bust": "there is no bust: {reason}",
     "bust-guessed": "{share:.0%} of the face in bust.ply is copied from the fitted head, because the photographs did not measure it: add cameras that see the face, or use light that shows more texture",
     "hair-beyond-head": "the vertices of head_hair reach only {share:.0%} of the hair within 2 mm: use bust.ply, which contains all hair",

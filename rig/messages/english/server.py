@@ -201,8 +201,6 @@ TEMPLATES = {
     "points-suggested": "{count} point suggested. Check it, then accept it. | {count} points suggested. Check each, then accept them.",
     "features-saved": "Saved. Jobs use these points from now on.",
     "job-queued": "Queued job {job}.",
-    "further-settings-no-json": "the further settings are no JSON ({reason})",
-    "further-settings-no-object": 'the further settings are no JSON object, such as {"fitting": {"modes": 80}}',
     "jobs-active": "These jobs are queued or running; cancel them first.",
     "jobs-with-heads": "{count} jobs with their heads",
     "jobs-removed-count": "{count} removed.",

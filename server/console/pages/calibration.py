@@ -4,6 +4,7 @@ ones."""
 import threading
 from collections.abc import Mapping
 
+from calibration.board.board import board_from_document
 from rig.errors import InputError
 from rig.messages.message import Message, compose
 from server.console.coverage import Corners, advice, detect_shot, summary
@@ -111,8 +112,6 @@ def shoot(page: Page, event: JsonObject) -> Message:
     Raises InputError for an impossible board, Conflict if earlier shots show a different board, InvalidInput if no
     camera sees the board, and what ``Captures.take`` raises.
     """
-    from calibration.board.board import board_from_document
-
     board, service = board_of(event), page.service
     board_from_document(board)
     shots.check(board)

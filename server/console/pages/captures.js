@@ -98,7 +98,7 @@ export default spoken({
     "current.id": {
       handler(id) {
         this.readChecks(id);
-        if (this.withFaces && !this.current?.board) this.readFaces(id);
+        if (this.withFaces && this.current?.kind === "shot") this.readFaces(id);
         this.removal = null;
         if (!this.state.loading) this.keepAddress();
       },
@@ -146,7 +146,9 @@ export default spoken({
         <span class="lead">{{ state.loading ? say('Reading') : narrowed ? say('Found: {count}', { count: state.total })
           : say('{count} capture | {count} captures', { count: state.total }) }}</span>
         <template v-if="current">
-          <template v-if="!current.board">
+          <button v-if="current.kind === 'film'" class="b main-action" id="track" :disabled="!!busy"
+            @click="act('reconstruct', current.id, { model })">Track the head</button>
+          <template v-if="current.kind === 'shot'">
             <button class="b" :aria-pressed="outlines" @click="outlines = !outlines">Silhouettes</button>
             <button class="b" id="faces" :aria-pressed="withFaces" :aria-busy="!!finding"
               @click="showFaces(current.id)">{{ say(finding ? 'Looking for faces ...' : 'Faces') }}</button>
@@ -319,7 +321,8 @@ export default spoken({
               <span class="small muted">
                 <template v-if="c.label">{{ clock(c.created) }} &middot;
                   </template>{{ say(c.source === 'rig' ? 'rig' : 'upload') }} &middot;
-                  {{ say('{count} camera | {count} cameras', { count: c.cameras.length }) }} &middot;
+                  <template v-if="c.frames">{{ say('film of {count} frames', { count: c.frames }) }} &middot;
+                  </template>{{ say('{count} camera | {count} cameras', { count: c.cameras.length }) }} &middot;
                   {{ size(c.bytes) }}</span>
               <span v-if="c.session || c.expression || c.features || c.tags.length"
                 class="small muted cut">{{ [name(sessions.find(s => s.id === c.session)), c.expression,
@@ -392,7 +395,7 @@ export default spoken({
                 <option v-for="s in sessions" :key="s.id" :value="s.id">{{ name(s) }}</option>
               </select>
             </label>
-            <label class="field" :title="say(preset?.explanation)">Settings<select v-model="method" id="method"
+            <label v-if="!current.frames" class="field" :title="say(preset?.explanation)">Settings<select v-model="method" id="method"
               aria-describedby="preset">
                 <option v-for="p in state.presets" :key="p.id" :value="p.id">{{ say(p.title) }}</option>
               </select>
@@ -402,7 +405,7 @@ export default spoken({
                 <option v-for="m in models.filter(m => m !== 'default')" :key="m">{{ m }}</option>
               </select>
             </label>
-            <label v-if="templates.length" class="field"
+            <label v-if="templates.length && !current.frames" class="field"
               title="Write the head in the vertex order of this mesh, too">Template<select v-model="template"
               id="template">
                 <option value="">none</option>
@@ -410,19 +413,19 @@ export default spoken({
               </select>
             </label>
           </form>
-          <p v-if="current && large === null && !current.board && preset" id="preset" class="small muted"
+          <p v-if="current && large === null && current.kind === 'shot' && preset" id="preset" class="small muted"
             style="margin-bottom: .7rem">{{ say(preset.explanation) }}</p>
           <p v-if="current && large === null && current.jobs.length" class="line wrap small" id="jobs-of-capture"
             style="margin-bottom: .7rem">
             <span class="muted">Jobs</span>
             <a v-for="j in current.jobs.slice(0, 12)" :key="j.id" class="tag" :class="jobKind(j)"
-              :href="j.state === 'succeeded' ? '/result/' + j.id
-                : '/jobs?job=' + j.id">{{ say(j.state === 'succeeded' ? 'head' : j.state) }}
+              :href="j.state === 'succeeded' && !current.frames ? '/result/' + j.id
+                : '/jobs?job=' + j.id">{{ say(j.state !== 'succeeded' ? j.state : current.frames ? 'tracked' : 'head') }}
                 {{ j.progress === null ? j.id.slice(-6) : Math.round(100 * j.progress) + ' %' }}</a>
             <a v-if="current.jobs.length > 12"
               :href="'/jobs?find=' + current.id">{{ say('all {count}', { count: current.jobs.length }) }}</a>
           </p>
-          <verdict v-if="current && large === null && !current.board" :capture="current"
+          <verdict v-if="current && large === null && current.kind === 'shot'" :capture="current"
             style="margin-bottom: .7rem"></verdict>
           <p v-if="current && large === null && facesTold(current.id)" class="small muted" role="status" id="faces-told"
             style="margin-bottom: .7rem">{{ facesTold(current.id) }}</p>
@@ -432,7 +435,7 @@ export default spoken({
               :style="{ aspectRatio: current.size.width + ' / ' + current.size.height }"
               :aria-label="say('Enlarge {name}', { name: camera })" @click="large = i">
               <img :src="address(camera, '.jpg')" :alt="say('Picture of {name}', { name: camera })" loading="lazy">
-              <img v-if="outlines && !current.board" :src="address(camera, '.silhouette.png')" alt="" @error="failed">
+              <img v-if="outlines && current.kind === 'shot'" :src="address(camera, '.silhouette.png')" alt="" @error="failed">
               <outline v-else :view="view(current.id, camera)" :size="current.sizes[camera]"></outline>
               <face-marks :faces="facesIn(current.id, camera)" :size="current.sizes[camera]"></face-marks>
               <span>{{ camera }}{{ camera === current.front ? ' · ' + say('front') : '' }} <b
@@ -454,7 +457,7 @@ export default spoken({
             <div class="thumb" style="aspect-ratio: auto">
               <img :src="address(current.cameras[large], '.image')"
                 :alt="say('Picture of {name}', { name: current.cameras[large] })">
-              <img v-if="outlines && !current.board" :src="address(current.cameras[large], '.silhouette.png')" alt="">
+              <img v-if="outlines && current.kind === 'shot'" :src="address(current.cameras[large], '.silhouette.png')" alt="">
               <face-marks :faces="facesIn(current.id, current.cameras[large])"
                 :size="current.sizes[current.cameras[large]]"></face-marks>
             </div>
@@ -531,7 +534,7 @@ export default spoken({
       const told = [
         running.length && { text: `${Math.round(100 * (running[0].progress || 0))} %`, kind: "accent" },
         of("queued").length && { text: say("queued | {count} queued", { count: of("queued").length }), kind: "" },
-        heads && { text: say("head | {count} heads", { count: heads }), kind: "good" },
+        heads && { text: c.frames ? say("tracked") : say("head | {count} heads", { count: heads }), kind: "good" },
         failed && { text: say("failed | {count} failed", { count: failed }), kind: "fault" },
       ].filter(Boolean);
       return told.length ? told : [{ text: say(c.jobs.length ? "cancelled" : "new"), kind: "" }];

@@ -28,7 +28,7 @@ SHOWN = 50  # captures of a page
 ASKED = ("find", "session", "verdict", "tag", "sort", "after", "capture")
 OF_RECORD = (
     *("id", "created", "source", "label", "expression", "front"),
-    *("features", "bytes", "session", "board", "verdict"),
+    *("features", "bytes", "session", "kind", "frames", "verdict"),
 )
 SESSIONS_SHOWN = 200  # newest ones, in lists to choose from; older ones are found on the page Subjects
 
@@ -201,9 +201,9 @@ def captures_state(service: Service, requested: Mapping[str, str | None]) -> Jso
 
 
 def reconstruct(page: Page, event: JsonObject) -> Message:
-    """Queues a job for a capture; the page shows the head when it is ready. Raises what ``Jobs.submit`` raises."""
+    """Queues a job for a capture; the page shows a shot's head when it is ready. Raises what ``Jobs.submit`` raises."""
     job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
-    page.started(job.id, opens=True)
+    page.started(job.id, opens=job.frames is None)
     return compose("job-queued-watch", job=job.id[-6:])
 
 
@@ -265,10 +265,10 @@ def discard(page: Page, event: JsonObject) -> None:
     Conflict while a queued or running job needs the capture."""
     service, identity = page.service, event["id"]
     record = service.captures.check_unused(identity)
-    heads = len(service.captures.holdings(identity).heads)
-    title = compose("capture-pictures", pictures=len(record.cameras), name=record.label or identity[-6:])
-    if heads:
-        title = compose("heads-stay", thing=title, count=heads)
+    held = service.captures.holdings(identity)
+    title = compose("capture-pictures", pictures=held.pictures, name=record.label or identity[-6:])
+    if held.heads:
+        title = compose("heads-stay", thing=title, count=len(held.heads))
     remove_later(identity, lambda: service.captures.remove(identity), title, "capture")
 
 

@@ -97,7 +97,9 @@ export default spoken({
           <button class="b" v-if="active" id="cancel" :disabled="!!busy" @click="act('cancel')">Cancel</button>
           <button class="b" v-else :disabled="!!busy" @click="act('delete')">Remove</button>
           <button class="b" id="restart" :disabled="!!busy" @click="open">Restart</button>
-          <a class="b main-action" v-if="job.state === 'succeeded'" id="to-result"
+          <a class="b main-action" v-if="job.state === 'succeeded' && job.frames" id="all"
+            :href="'/console/jobs/' + job.id + '/all.zip'" download>All files (.zip)</a>
+          <a class="b main-action" v-else-if="job.state === 'succeeded'" id="to-result"
             :href="'/result/' + job.id">Open the head</a>
         </template></header>
       <div class="columns" style="grid-template-columns: 24rem minmax(0, 1fr)">
@@ -247,6 +249,8 @@ export default spoken({
                 <div class="line wrap">
                   <strong class="grow"
                     style="flex-basis: 12rem">{{ job.state === 'running' ? stageWords(job.stage) : waiting }}</strong>
+                  <span v-if="job.frames_done !== null" class="num" id="frames">{{ say('{done} of {all} frames',
+                    { done: job.frames_done, all: job.frames }) }}</span>
                   <span class="num">{{ Math.round(100 * job.progress) }} %</span>
                   <span v-if="job.state === 'running' && job.eta_s !== null"
                     class="num muted">{{ say('about {time} left', { time: span(job.eta_s) }) }}</span>
@@ -255,7 +259,7 @@ export default spoken({
                 <p
                   class="muted small">Residuals by camera, silhouettes and overlays stand here when the job is done.</p>
               </div>
-              <p v-else class="muted">The job left no report.</p>
+              <p v-else-if="!job.frames" class="muted">The job left no report.</p>
               <div class="stack">
                 <h3>Log</h3>
                 <table class="small log">

@@ -1,11 +1,9 @@
 """Implements the page Jobs: queue, progress, log, cancel, restart with other settings, and figures of a job."""
 
-import json
 from collections.abc import Callable, Mapping
 from typing import cast, get_args
 
 from pipeline.head_model.model_names import list_models
-from rig.errors import InputError
 from rig.messages.message import Message, compose
 from server.console.page import (
     Action,
@@ -29,6 +27,7 @@ from server.services.work import ReconstructionRequest
 from server.storage.events import JobEvent
 from server.storage.job_index import JobOrder, JobQuery
 from server.storage.records import JsonObject
+from server.tasks.settings_file import settings_of_text
 
 SHOWN = 50  # jobs of a page, and of those that wait before them
 SOUGHT_MOST = 1000  # queued jobs among which a search looks for the next ones
@@ -107,7 +106,7 @@ def job_detail(service: Service, job_id: str) -> JsonObject:
     def make() -> JsonObject:
         events = service.jobs.events.since(job_id, 0, limit=10_000)
         report = read_report(service, job_id) if finished else None
-        cameras = {} if report is None else report.get("cameras", {})
+        cameras = {} if report is None or "frames" in report else report.get("cameras", {})  # a film has no figures
         return {
             "id": job_id,
             "log": log_lines(events)[-LOG_LINES:],
@@ -116,7 +115,7 @@ def job_detail(service: Service, job_id: str) -> JsonObject:
             "seconds": {} if report is None else report.get("seconds", {}),
             "stopped_because": None if report is None else report.get("stopped_because"),
             "evaluations": None if report is None else report.get("evaluations"),
-            "pictures": report is not None,
+            "pictures": bool(cameras),
         }
 
     return shared.get(("detail", job_id, finished), 3600.0 if finished else 0.4, make)
@@ -137,19 +136,14 @@ def restart(page: Page, event: JsonObject) -> Message:
     wanted = ReconstructionRequest(event.get("model") or None, chosen_settings(event))
     job = page.service.jobs.restart(event["id"], wanted, key=page.caller.key)
     page.choice["job"] = job.id
-    page.started(job.id, opens=True)
+    page.started(job.id, opens=job.frames is None)
     return compose("job-queued", job=job.id[-6:])
 
 
 def chosen_settings(event: JsonObject) -> Mapping[str, object]:
     """Reads the settings of a form: method, detail, front, and further ones from the JSON text ``more``. Raises
     InputError if ``more`` is no JSON object."""
-    try:
-        settings = json.loads(event.get("more") or "{}")
-    except ValueError as error:
-        raise InputError("settings", [compose("further-settings-no-json", reason=str(error))]) from error
-    if not isinstance(settings, dict):
-        raise InputError("settings", [compose("further-settings-no-object")])
+    settings = settings_of_text(event.get("more") or "{}")
     return settings | {key: event.get(key) for key in ("method", "detail", "front") if event.get(key)}
 
 

@@ -77,10 +77,10 @@ def heads_of_subject(service: Service, head: JsonObject) -> list[JsonObject]:
 
 
 def result_lines(service: Service, jobs: Iterable[JobOut]) -> list[JsonObject]:
-    """Converts jobs that have a result to entries of the page's list, each with label and time of its capture
-    (``capture``, ``captured``) and the name of its ``subject``."""
+    """Converts jobs that have made a head, as those of films have not, to entries of the page's list, each with label
+    and time of its capture (``capture``, ``captured``) and the name of its ``subject``."""
     lines = []
-    for job in jobs:
+    for job in (job for job in jobs if job.frames is None):
         line, of_capture = job.model_dump(include=OF_JOB), capture_of(service, job)
         subject = ""
         if of_capture["session"]:

@@ -85,7 +85,7 @@ export const started = {
       this.typed = []; // what stands in a form since before is sent, or kept for a reload
       this.mine = [...this.mine, ...jobs.map((id) => ({ id, path: location.pathname, opens }))];
     },
-    ended({ id, state }) {
+    ended({ id, state, frames }) {
       const job = this.mine.find((one) => one.id === id);
       if (!job) return;
       this.mine = this.mine.filter((one) => one.id !== id);
@@ -100,7 +100,8 @@ export const started = {
         location.href = `/result/${id}`;
       } else {
         this.tell();
-        this.announce("done", "A head is ready.", [], `/result/${id}`);
+        if (frames) this.announce("done", "A film is tracked.", [], `/jobs?job=${id}`);
+        else this.announce("done", "A head is ready.", [], `/result/${id}`);
       }
     },
     occupied() {

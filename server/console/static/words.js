@@ -71,6 +71,9 @@ const STAGES = {
   structure: "placing the cameras",
   scale: "measuring the scale",
   silhouettes: "comparing silhouettes",
+  identity: "finding the person's head in the sharpest frames",
+  frames: "tracking the head from frame to frame",
+  preview: "drawing the preview",
 };
 // What decides how fine a head becomes, and who solves: what stands in settings and reports is said in words.
 export const LEVELS = {

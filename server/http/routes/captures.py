@@ -1,6 +1,5 @@
 """Declares the routes of captures: taking, uploading, viewing and removing captures, and setting feature points."""
 
-import json
 from collections.abc import Callable
 from functools import partial
 from typing import Annotated, Literal
@@ -8,7 +7,6 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import FileResponse
 
-from rig.errors import InputError
 from rig.messages.message import compose
 from server.errors import Forbidden
 from server.http.auth import Reader, ServiceOf, Submitter, Taker
@@ -36,6 +34,7 @@ from server.services.texts import PLAIN, TEXT_MOST, checked_tags
 from server.services.work import ReconstructionRequest
 from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.records import CaptureRecord
+from server.tasks.settings_file import settings_of_text
 from server.wire.fetch import fetch_archive, fetch_stored_capture
 from server.wire.multipart import ABOUT, ARCHIVE, described_form, receive_capture
 from server.wire.problems import Responses, documented, sent_file
@@ -224,7 +223,7 @@ async def reconstruct_upload(
     try:
         name = (fields.get("name") or "")[:TEXT_MOST]
         place = fields.get("deliver_to") or None
-        settings = _settings_of(fields.get("settings"))
+        settings = settings_of_text(fields["settings"]) if fields.get("settings") else None
         wanted = ReconstructionRequest(fields.get("model") or None, settings, name, deliver_to=place)
         submit = partial(service.jobs.submit, record.id, wanted, key=caller.key, idempotency_key=idempotency_key)
         job = await service.threads.disk(submit)
@@ -235,18 +234,6 @@ async def reconstruct_upload(
         service.store.remove_capture(record.id, later=True)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
-
-
-def _settings_of(text: str | None) -> dict[str, object] | None:
-    if not text:
-        return None
-    try:
-        document = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError("settings", [compose("no-json-because", reason=str(error))]) from error
-    if not isinstance(document, dict):
-        raise InputError("settings", [compose("settings-no-json-object")])
-    return document
 
 
 def _created(record: CaptureRecord, response: Response) -> CaptureOut:

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Response
 from fastapi.responses import FileResponse
 from pydantic import Field
 
+from pipeline.head_model.model_names import list_models, model_path
 from rig.messages.message import compose
 from server.http.auth import Admin, Reader, ServiceOf
 from server.http.schemas import Received, example
@@ -177,8 +178,6 @@ def info(service: ServiceOf, caller: Reader) -> InfoOut:
 @router.get("/v1/models", tags=["models"], responses=documented())
 def list_models_at_hand(service: ServiceOf, caller: Reader) -> ModelList:
     """Lists the head models that a job may name."""
-    from pipeline.head_model.model_names import list_models, model_path
-
     default = model_path("default").resolve()
     models = [
         {"id": name, "name": name, "bytes": path.stat().st_size, "default": path.resolve() == default}

@@ -73,7 +73,7 @@ def test_a_job_is_cancelled_and_begun_with_other_settings(v: Visit, service: Run
     page.reload()
     expect(page.get_by_label("Front camera")).to_have_value("fail")  # what was typed outlives a reload
     page.get_by_role("button", name="Queue the new job").click()
-    expect(page.get_by_text("the further settings are no JSON")).to_be_visible()
+    expect(page.get_by_text("the text is no JSON")).to_be_visible()
     expect(page.get_by_label("Front camera")).to_have_value("fail")  # a refused form keeps what was typed
     page.get_by_label("Further settings").fill("")
     page.get_by_role("button", name="Queue the new job").click()

@@ -101,7 +101,7 @@ def test_every_fault_of_a_list_is_named_with_its_line(shots: Path) -> None:
         (3, f"{shots / 'monday/gone'} is not there"),
         (4, "lamp.jpg is not a capture"),
         (5, "the row names no capture"),
-        (6, "settings: the content cannot be read"),
+        (6, "settings: the text is no JSON"),
         (7, "no.toml: the content cannot be read"),
         (8, "the row has 6 cells, but the first row names 4 columns"),
         (9, "[]: the content cannot be read"),

@@ -13,8 +13,8 @@ from rig.formats.pictures.images import read_image, write_image
 from server.console import media
 from server.console.media import THUMBNAIL_WIDTH, make_thumbnail
 from server.errors import NotFound
+from server.services.captures import picture_name
 from tests.support.at_once import run_at_once
-from tests.support.services import small_capture
 from tests.support.stored_captures import capture_record
 
 ROUTES = [
@@ -67,11 +67,9 @@ def test_two_that_ask_at_once_get_a_whole_picture(tmp_path: Path) -> None:
     assert read_image(target).shape == (360, 480, 3)
 
 
-def test_a_camera_is_found_by_its_name_alone(tmp_path: Path) -> None:
-    files = small_capture(tmp_path)
-    inputs = {path.relative_to(files).as_posix(): "" for path in files.rglob("*") if path.is_file()}
-    record = capture_record(inputs=inputs)
-    assert media._image_name(record, "cam01") == "images/cam01.png"
+def test_a_camera_is_found_by_its_name_alone() -> None:
+    record = capture_record(inputs=dict.fromkeys(["background/cam01.png", "cameras.json", "images/cam01.png"], ""))
+    assert picture_name(record, "images", "cam01") == "images/cam01.png"
     for other in ("cam1", "../images/cam01", "cam01.png", ""):
         with pytest.raises(NotFound):
-            media._image_name(record, other)
+            picture_name(record, "images", other)
