@@ -99,11 +99,11 @@ def test_a_film_with_faults_is_refused_in_the_words_of_the_command(
     for name in CAMERAS[:-1]:
         for number in (1, 2):
             (spoilt / "images" / name / f"{number:05}.png").rename(spoilt / "images" / name / f"{number}{name}.png")
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError) as of_command:
         open_footage(spoilt)
     refused = upload(http, packed(spoilt))
     assert (refused.status_code, refused.json()["type"]) == (422, "urn:eigenhead:problem:invalid-capture")
-    assert refused.json()["errors"] == [fault.text for fault in told.value.faults]
+    assert refused.json()["errors"] == [fault.text for fault in of_command.value.faults]
     assert len(refused.json()["errors"]) == 1
 
 

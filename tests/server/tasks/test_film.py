@@ -61,9 +61,9 @@ def test_a_films_files_are_taken_and_nothing_else(videos: Path, tmp_path: Path) 
 
 
 def test_pictures_too_large_are_named_once_a_folder(videos: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError) as refused:
         ingest_film(videos, tmp_path / "files", SIZE * SIZE - 1, silent)
-    named = [(fault.code, fault.parameters["file"]) for fault in told.value.faults]
+    named = [(fault.code, fault.parameters["file"]) for fault in refused.value.faults]
     files = ["background/cam00.png", *(f"videos/cam0{k}.avi" for k in range(3))]
     assert sorted(named) == [("picture-too-large", file) for file in files]
 
