@@ -122,9 +122,7 @@ def test_a_refused_upload_is_told_why(proxied: Proxied) -> None:
             assert answer.json()["type"].endswith("key-missing")
 
 
-def test_an_upload_its_events_and_its_result_pass_through(
-    proxied: Proxied, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_upload_events_and_result_pass(proxied: Proxied, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SSL_CERT_FILE", str(proxied.certificate))
     pack_folder(small_capture(tmp_path / "capture", size=400), tmp_path / "capture.tar")
     assert (tmp_path / "capture.tar").stat().st_size > 1 << 20  # nginx's own limit of a body

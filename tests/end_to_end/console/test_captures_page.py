@@ -21,9 +21,7 @@ from tests.support.services import (
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
-def test_an_archive_that_cannot_be_used_shows_every_fault(
-    browser: Browser, service: RunningService, tmp_path: Path
-) -> None:
+def test_an_unusable_archive_shows_every_fault(browser: Browser, service: RunningService, tmp_path: Path) -> None:
     v = visit(browser, service.url)
     page = v.go("/captures")
     expect(page.get_by_text("No captures yet")).to_be_visible()

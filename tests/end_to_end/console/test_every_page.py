@@ -59,9 +59,7 @@ def fill(service: RunningService, folder: Path, person: str = "") -> None:
             http.post("/v1/batches", json={"captures": [capture], "settings": settings})
 
 
-def test_every_page_can_be_read_and_used(
-    browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path
-) -> None:
+def test_every_page_is_accessible(browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path) -> None:
     """On a telephone, and dark and light at a desk: axe-core finds nothing, and each page says what to do."""
     v, found = visit(browser, service.url), []
     screenshots.mkdir(parents=True, exist_ok=True)

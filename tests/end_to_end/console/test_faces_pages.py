@@ -122,9 +122,7 @@ def reject_take_and_drag(page: Page) -> None:
     expect(page.locator("[data-offer]")).to_have_count(count - 3)
 
 
-def test_a_head_is_seen_with_the_face_that_its_photograph_shows(
-    browser: Browser, screenshots: Path, tmp_path: Path
-) -> None:
+def test_head_is_seen_with_face_that_its_photograph_shows(browser: Browser, screenshots: Path, tmp_path: Path) -> None:
     """The head is a ball; what lies over the photograph is the capture's face."""
     work = "tests.support.ball_results:work"
     with running_service(tmp_path / "data", work=work, console="true") as running:

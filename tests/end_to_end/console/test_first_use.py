@@ -97,7 +97,7 @@ def test_what_is_looked_at_stays_whatever_comes_in(v: Visit, service: RunningSer
     expect(page.locator("#removal")).to_have_count(0)  # it said that no head was made of it
 
 
-def test_what_is_not_found_can_be_left_and_new_things_take_the_cursor(
+def test_a_missing_page_can_be_left_and_new_things_take_the_cursor(
     v: Visit, service: RunningService, tmp_path: Path
 ) -> None:
     uploaded_capture(service, tmp_path, 1)

@@ -16,9 +16,7 @@ TONES = """window.tones = 0; const start = OscillatorNode.prototype.start;
   OscillatorNode.prototype.start = function (...when) { window.tones += 1; return start.apply(this, when); };"""
 
 
-def test_a_head_opens_where_it_was_begun_and_never_over_what_is_typed(
-    browser: Browser, screenshots: Path, tmp_path: Path
-) -> None:
+def test_a_head_opens_where_it_began_and_never_over_typing(browser: Browser, screenshots: Path, tmp_path: Path) -> None:
     work = "tests.support.ball_results:work"
     with running_service(tmp_path / "data", work=work, ball_s="1", console="true") as service:
         capture = uploaded_capture(service, tmp_path)

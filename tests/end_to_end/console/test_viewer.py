@@ -55,9 +55,7 @@ def off_the_ramp(shown: np.ndarray) -> np.ndarray:
     return off_colours(shown, np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(RAMP)]))
 
 
-def test_what_is_shown_is_what_the_files_hold(
-    browser: Browser, heads: RunningService, screenshots: Path, tmp_path: Path
-) -> None:
+def test_the_viewer_shows_the_files(browser: Browser, heads: RunningService, screenshots: Path, tmp_path: Path) -> None:
     v = visit(browser, heads.url)
     page = v.go("/result")
     page.wait_for_selector("canvas[data-loaded$=head]")
@@ -150,9 +148,7 @@ def assert_clear_of_rims(page: Page) -> None:
         assert rim.max() < 60
 
 
-def test_a_head_and_its_comparison_outlive_a_reload_and_its_files_bear_its_name(
-    browser: Browser, heads: RunningService
-) -> None:
+def test_a_head_and_its_comparison_outlive_a_reload_and_name_its_files(browser: Browser, heads: RunningService) -> None:
     v = visit(browser, heads.url)
     page = v.go("/result")
     page.wait_for_selector("canvas[data-loaded$=head]")

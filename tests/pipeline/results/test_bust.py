@@ -120,7 +120,7 @@ def test_files_hold_what_the_contract_says(result: Reconstruction, photographed,
 
 
 @pytest.mark.parametrize(("surface", "files"), [("head", {"head"}), ("bust", {"bust"}), ("both", {"head", "bust"})])
-def test_surface_says_which_are_written(
+def test_surface_says_what_is_written(
     surface, files: set[str], result: Reconstruction, photographed, tmp_path: Path
 ) -> None:
     requested = replace(SETTINGS, outputs=OutputSettings(surface=surface))
@@ -130,9 +130,7 @@ def test_surface_says_which_are_written(
     assert {path.stem for path in tmp_path.glob("*.glb")} == files
 
 
-def test_a_head_is_written_pushed_out_to_the_hair(
-    result: Reconstruction, photographed, renderer: Renderer, tmp_path: Path
-) -> None:
+def test_a_head_is_pushed_out_to_hair(result: Reconstruction, photographed, renderer: Renderer, tmp_path: Path) -> None:
     """The head is a ball of 57 mm, the bust one of 60 mm whose upper half is hair; a ball has no texture layout."""
     bust, capture, silhouettes = photographed
     part = np.where(bust.mesh_world.vertices[:, 1] > 0.0, Part.HAIR, Part.SKIN).astype(np.uint8)

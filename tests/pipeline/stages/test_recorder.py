@@ -112,7 +112,7 @@ def test_a_failed_block_stops_the_stage_beside_it(
 
 
 @pytest.mark.parametrize("threads", ["1", "2"])
-def test_what_fails_beside_fails_the_job(
+def test_a_failing_thread_fails_the_job(
     context: ReconstructionContext, monkeypatch: pytest.MonkeyPatch, threads: str
 ) -> None:
     monkeypatch.setenv("EIGENHEAD_THREADS", threads)

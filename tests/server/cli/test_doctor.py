@@ -61,9 +61,7 @@ def test_it_names_misspelt_variables_and_a_missing_rig_file(
     assert "rig.toml: the file cannot be read" in found["rig"]["detail"]
 
 
-def test_it_judges_the_number_of_threads(
-    examine: Callable[..., dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_judges_the_threads(examine: Callable[..., dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EIGENHEAD_THREADS", "97")
     found = examine(data=tmp_path)
     assert found["variables"]["ok"]

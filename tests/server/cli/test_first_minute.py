@@ -143,9 +143,7 @@ def test_serve_says_in_one_line_that_its_rig_file_its_port_or_its_folder_is_no_g
 
 
 @pytest.mark.parametrize("command", ["serve", "worker"])
-def test_a_database_that_is_down_is_one_line_without_its_password(
-    run: Run, monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
+def test_a_database_down_is_one_line_without_password(run: Run, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))  # and nobody listens
         url = f"postgresql://eigenhead:secret@127.0.0.1:{closed.getsockname()[1]}/heads"
@@ -211,9 +209,7 @@ def test_wrong_usage_is_status_2_and_is_named(run: Run, tmp_path: Path, line: st
         ("convert {shot} --to colmap", "file/sparse", "cannot be written"),
     ],
 )
-def test_an_output_that_cannot_be_written_is_found_before_the_work(
-    run: Run, tmp_path: Path, line: str, place: str, why: str
-) -> None:
+def test_an_unwritable_output_is_found_before_work(run: Run, tmp_path: Path, line: str, place: str, why: str) -> None:
     (tmp_path / "file").touch()
     shot = small_capture(tmp_path / "shot")
     done = run(*line.format(shot=shot).split(), "--out", tmp_path / place)

@@ -117,9 +117,7 @@ def test_a_failure_is_one_clear_line_and_status_1(tmp_path: Path) -> None:
         ("DATABASE_URL", "postgresql://a:port/b", "is no database's URL"),
     ],
 )
-def test_a_wrong_variable_is_wrong_usage_and_is_named(
-    name: str, value: str, text: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrong_variable_is_wrong_usage(name: str, value: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(f"EIGENHEAD_{name}", value)
     with pytest.raises(typer.BadParameter) as refused:
         service_settings()

@@ -188,9 +188,7 @@ def test_failed_captures_are_tried_again_and_no_others(http: httpx.Client, captu
     assert (answer.status_code, answer.json()["type"]) == (409, URN + "none-failed")
 
 
-def test_what_is_erased_meanwhile_is_counted_and_leaves_nothing(
-    service: RunningService, http: httpx.Client, tmp_path: Path
-) -> None:
+def test_the_erased_is_counted_and_leaves_nothing(service: RunningService, http: httpx.Client, tmp_path: Path) -> None:
     """Captures that wait, one whose job runs, and one that is done."""
     session = http.post("/v1/sessions", json={"label": "Erased Elif"}).json()["id"]
     theirs = [uploaded_capture(service, tmp_path, seed) for seed in range(20, 24)]

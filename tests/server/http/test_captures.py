@@ -160,9 +160,7 @@ def test_a_session_without_captures_is_asked_as_much(http: httpx.Client) -> None
     assert (refused.status_code, "did you mean 'detail'" in refused.text) == (422, True)
 
 
-def test_a_change_may_be_meant_for_one_state_alone_and_head_is_get_without_content(
-    http: httpx.Client, archive: bytes
-) -> None:
+def test_a_change_may_be_for_one_state_alone_and_head_is_get_without_body(http: httpx.Client, archive: bytes) -> None:
     path = f"/v1/captures/{upload(http, archive).json()['id']}"
     got = http.get(path)
     known = {"If-Match": got.headers["ETag"]}

@@ -40,9 +40,7 @@ def keys(service: RunningService) -> list[str]:
 
 
 @pytest.mark.parametrize("segment", [65_533, 20])
-def test_metadata_is_refused_before_it_is_read(
-    service: RunningService, keys: list[str], tmp_path: Path, segment: int
-) -> None:
+def test_metadata_is_refused_unread(service: RunningService, keys: list[str], tmp_path: Path, segment: int) -> None:
     archive = heavy_capture(tmp_path / "capture", segment)
     with client(service, keys[0]) as http:
         answer = upload(http, archive)
@@ -74,9 +72,7 @@ def calm(service: RunningService, keys: list[str]) -> Witness:
     return witness
 
 
-def test_thousands_of_small_requests_of_a_key_leave_others_their_time(
-    service: RunningService, keys: list[str], calm: Witness
-) -> None:
+def test_thousands_of_small_requests_leave_others_time(service: RunningService, keys: list[str], calm: Witness) -> None:
     with Witness(service, keys[1]).watching() as witness:
         assert ask_often(service, keys[0], "/v1/captures", 1000) == {200}
     witness.check(calm)
@@ -106,9 +102,7 @@ def test_requests_that_wait_leave_their_key_its_time(service: RunningService, ke
     assert "unforeseen" not in service.log.read_text()  # of clients who went
 
 
-def test_a_client_who_goes_in_the_midst_of_a_body_is_no_fault_of_the_service(
-    service: RunningService, keys: list[str]
-) -> None:
+def test_a_client_who_goes_amid_a_body_is_no_fault_of_the_service(service: RunningService, keys: list[str]) -> None:
     with client(service, keys[0]) as http:
         made = http.post("/v1/uploads", headers={"Tus-Resumable": "1.0.0", "Upload-Length": "1000"})
     head = (

@@ -84,9 +84,7 @@ def test_an_idempotency_key_makes_one_job(http: httpx.Client, archive: bytes) ->
     assert other.status_code == 409
 
 
-def test_an_upload_that_is_sent_again_with_its_key_makes_one_job_and_one_capture(
-    http: httpx.Client, archive: bytes
-) -> None:
+def test_an_upload_sent_again_with_its_key_makes_one_job_and_one_capture(http: httpx.Client, archive: bytes) -> None:
     def send(data: bytes = archive, key: str = "again", **fields: str) -> httpx.Response:
         files = {"file": ("shot.zip", data)}
         return http.post("/v1/reconstructions", files=files, data=fields, headers={"Idempotency-Key": key})
@@ -130,9 +128,7 @@ def test_a_stage_that_reports_nothing_still_moves(http: httpx.Client, client: Cl
 
 
 @pytest.mark.parametrize("mode", ["long", "deaf"])
-def test_a_cancelled_job_stops_in_the_midst_of_its_work(
-    service: RunningService, http: httpx.Client, capture: str, mode: str
-) -> None:
+def test_a_cancelled_job_stops_its_work(service: RunningService, http: httpx.Client, capture: str, mode: str) -> None:
     """``deaf`` work never looks whether it should stop; its process is killed."""
     job = http.post("/v1/jobs", json={"capture_id": capture, "settings": {"front": mode}}).json()["id"]
     folder = service.data / "jobs" / job

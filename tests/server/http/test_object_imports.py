@@ -73,9 +73,7 @@ def test_what_is_too_large_is_not_fetched(service: RunningService, bucket: Any, 
 
 
 @pytest.mark.parametrize("fault", ["503", "silent", "torn", "flipped"])
-def test_a_store_that_is_away_is_a_503_and_the_next_call_goes_through(
-    fault: Any, service: RunningService, way: Network
-) -> None:
+def test_an_absent_store_is_a_503_and_the_next_call_passes(fault: Any, service: RunningService, way: Network) -> None:
     way.fail(fault, 1000, "GET")
     answer = imported(service, "s3://studio-in/in/anna.tar")
     way.heal()

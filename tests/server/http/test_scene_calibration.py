@@ -59,7 +59,7 @@ def test_pictures_of_a_scene_become_a_calibration(service: RunningService, http:
 
 
 @pytest.mark.slow
-def test_shots_of_the_rig_become_one_or_are_refused_with_the_views(
+def test_shots_become_one_or_are_refused_with_the_views(
     service: RunningService, http: httpx.Client, tmp_path: Path
 ) -> None:
     """Of noise, in which nothing is found again; the capture's own pictures stay where they are."""

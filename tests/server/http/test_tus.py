@@ -27,7 +27,7 @@ def uploads(tmp_path: Path) -> ResumableUploads:
 
 
 @pytest.mark.parametrize(("checksum", "kept"), [(None, 30), ("sha256 AAAA", 0)])
-def test_a_client_that_vanished_is_given_up_and_what_it_sent_stays(
+def test_a_vanished_client_is_given_up_and_its_bytes_stay(
     uploads: ResumableUploads, checksum: str | None, kept: int
 ) -> None:
     """Bytes under a checksum count only all together."""
@@ -56,9 +56,7 @@ def test_only_the_pause_counts_and_not_the_whole(uploads: ResumableUploads) -> N
     assert asyncio.run(append(uploads, record, stream(), checksum, Threads(), silent_s=0.2)) == 100
 
 
-def test_an_upload_is_not_removed_under_who_writes_to_it(
-    service: RunningService, http: httpx.Client, archive: bytes
-) -> None:
+def test_an_upload_is_not_removed_under_its_writer(service: RunningService, http: httpx.Client, archive: bytes) -> None:
     where = http.post("/v1/uploads", headers=TUS | {"Upload-Length": str(len(archive))}).headers["location"]
     head = f"PATCH {where} HTTP/1.1\r\nHost: 127.0.0.1:{service.port}\r\nTus-Resumable: 1.0.0\r\nUpload-Offset: 0\r\n"
     head += (

@@ -99,9 +99,7 @@ def test_what_is_fetched_is_compared(blobs: CaptureBlobs, tmp_path: Path) -> Non
     assert [path.name for path in folder.iterdir()] == ["features"]
 
 
-def test_a_capture_is_unseen_until_all_of_it_is_there(
-    blobs: CaptureBlobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_captures_are_unseen_until_whole(blobs: CaptureBlobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = new_id()
     inputs = written(tmp_path / "mine", a=b"1", b=b"2", c=b"3")
     put, done = FolderObjects.put, []

@@ -168,9 +168,7 @@ def test_a_record_that_no_column_takes_does_not_keep_the_service_from_starting(s
     assert not any("\0" in text for text in stored_texts)
 
 
-def test_a_page_of_people_passes_over_who_was_erased_meanwhile(
-    store: Store, library: Library, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_page_of_people_skips_who_was_erased(store: Store, library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
     for number in (1, 2):
         store.add_session(session(number, f"Anna {number}"))
 

@@ -178,9 +178,7 @@ def test_an_equal_object_is_left_and_a_damaged_one_is_replaced(
     assert s3.fetch("head.ply", tmp_path / "back") == digest
 
 
-def test_erasing_takes_every_version_and_what_was_half_uploaded(
-    s3: ObjectStore, bucket: Any, below: str, tmp_path: Path
-) -> None:
+def test_erasing_takes_every_version_and_half_uploads(s3: ObjectStore, bucket: Any, below: str, tmp_path: Path) -> None:
     for text in (b"one", b"two", b"three"):
         s3.put("anna/head.ply", *made(tmp_path, text))
     bucket.delete_object(Bucket="studio", Key=f"{below}anna/head.ply")  # leaves a marker, and all three
@@ -204,9 +202,7 @@ store.put("head.ply", path, hashlib.sha256(path.read_bytes()).hexdigest())
 """
 
 
-def test_a_kill_between_two_parts_shows_nothing(
-    s3: ObjectStore, bucket: Any, below: str, network: Network, tmp_path: Path
-) -> None:
+def test_a_kill_midway_is_unseen(s3: ObjectStore, bucket: Any, below: str, network: Network, tmp_path: Path) -> None:
     head, digest = made(tmp_path, bytes(20 << 20))
     network.plan = lambda method, path: "silent" if "partNumber=2" in path else None
     command = [sys.executable, "-c", PUT, f"s3://studio/{below}", network.url, str(head)]
@@ -225,7 +221,7 @@ def test_a_kill_between_two_parts_shows_nothing(
     assert s3.fetch("head.ply", tmp_path / "back") == digest
 
 
-def test_what_the_store_will_not_do_says_so(
+def test_what_a_store_refuses_is_told(
     network: Network, bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, digest = made(tmp_path, b"a head")

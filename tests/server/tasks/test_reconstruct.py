@@ -65,9 +65,7 @@ def test_a_capture_folder_becomes_a_head(renderer: Renderer, shot: SimulatedCapt
     assert any((tmp_path / "cache").rglob("*"))  # the silhouettes, for the next job
 
 
-def test_an_empty_studio_is_refused_and_leaves_no_result(
-    renderer: Renderer, shot: SimulatedCapture, tmp_path: Path
-) -> None:
+def test_an_empty_studio_is_refused_without_result(renderer: Renderer, shot: SimulatedCapture, tmp_path: Path) -> None:
     nobody = {name: plates[0] for name, plates in shot.capture.backgrounds.items()}
     write_capture(tmp_path / "capture", replace(shot.capture, images=nobody, features={}), shot.rig)
     with pytest.raises(TooFewViews, match="cam06"):
@@ -102,9 +100,7 @@ def test_auto_leaves_software_alone_and_gl_takes_it() -> None:
 
 
 @pytest.mark.gl
-def test_the_device_is_made_once_a_process_and_many_threads_need_none(
-    renderer: Renderer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_device_is_made_once_and_many_threads_need_none(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
     context, settings = WorkerContext(), replace(Settings(), device="gl")
     first = matching_device(context, settings, renderer)
     assert first is not None

@@ -86,7 +86,7 @@ def test_files_come_from_the_store_and_new_feature_points_too(served: Store, cap
             assert (folder / "features.json").read_bytes() == content
 
 
-def test_a_capture_that_is_on_its_way_is_awaited(
+def test_captures_on_the_way_are_awaited(
     settings: ServiceSettings, served: Store, remote: Store, tmp_path: Path
 ) -> None:
     (tmp_path / "nas").rename(tmp_path / "away")

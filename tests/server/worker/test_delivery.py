@@ -154,9 +154,7 @@ def test_what_the_store_refuses_fails_and_is_delivered_elsewhere(
     assert there == NAMES | {"delivery.json"}
 
 
-def test_a_job_that_is_removed_meanwhile_is_not_delivered(
-    client: httpx.Client, capture: str, bucket: Any, way: Network
-) -> None:
+def test_a_job_removed_meanwhile_is_undelivered(client: httpx.Client, capture: str, bucket: Any, way: Network) -> None:
     way.fail("503", 10_000, "PUT")
     job = submitted(client, capture, "s3://studio-out/heads/")
     await_true(lambda: any(job in path for _, path in way.seen))

@@ -133,9 +133,7 @@ def test_a_capture_goes_from_the_data_folder_and_comes_back(
     await_true(lambda: not versions())  # a sweep that was storing the capture again takes that back
 
 
-def test_a_capture_is_taken_while_the_store_is_away(
-    client: httpx.Client, bucket: Any, way: Network, tmp_path: Path
-) -> None:
+def test_capture_is_taken_while_store_is_away(client: httpx.Client, bucket: Any, way: Network, tmp_path: Path) -> None:
     way.fail("503", 10_000, "PUT")
     answer = upload(client, packed(small_capture(tmp_path / "late", 4)))
     assert answer.status_code == 201

@@ -74,7 +74,7 @@ def events_of(worker: Worker) -> list[dict[str, Any]]:
     return [dict(event.document) for event in worker.events.since(JOB, 0)]
 
 
-def test_a_job_begins_where_its_capture_is_and_the_disk_has_room(
+def test_a_job_begins_with_its_capture_and_disk_space(
     worker: Worker, capture: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     worker.ingest(JOB, request(capture))

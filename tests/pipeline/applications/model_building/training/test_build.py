@@ -97,7 +97,7 @@ def moved(scan: Scan, name: str, by: float) -> Scan:
     ],
     ids=["sound", "cm", "m", "swapped", "inverted", "mirrored", "cm and inverted", "small hole"],
 )
-def test_what_has_a_plain_remedy_is_repaired(
+def test_plain_faults_are_mended(
     sound: Scan, model: HeadModel, spoil: Callable[[Scan], Scan], word: str | None
 ) -> None:
     """Whatever was done to it, the scan that comes out is the sound one (but for the hole, which stays)."""
