@@ -24,7 +24,7 @@ SURE_MM = 0.5  # no guess is better
 # About an ear within which the head says where it ends. And how far it may stand out of its outlines, which would cut a
 # thin rim to shreds.
 EAR_MM, EAR_SPARED_MM = 15.0, 10.0
-LEAST_COSINE = 0.1  # between a ray and a head's surface: a cone nine radii off says nothing
+MIN_COSINE = 0.1  # between a ray and a head's surface: a cone nine radii off says nothing
 CANDIDATES = 8  # of the head's triangles, for the one nearest to a place
 
 
@@ -75,7 +75,7 @@ def hull_excess_mm(
     the camera's ray is tangential; a ball of the same radius tells how far the cone is off elsewhere."""
     rays = vertices[:, None] - cameras
     sines = np.abs((rays * normals[:, None]).sum(axis=2)) / np.linalg.norm(rays, axis=2)
-    cosine = np.sqrt(np.maximum(1.0 - sines.min(axis=1) ** 2, LEAST_COSINE**2))
+    cosine = np.sqrt(np.maximum(1.0 - sines.min(axis=1) ** 2, MIN_COSINE**2))
     return np.linalg.norm(vertices - vertices.mean(axis=0), axis=1) * (1.0 / cosine - 1.0)
 
 
