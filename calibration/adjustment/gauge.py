@@ -168,8 +168,8 @@ def effective_pose(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Fl
 
 def image_sigma(rig: Rig, covariance: Float[np.ndarray, "c 15 c 15"]) -> Float[np.ndarray, " c"]:
     """Computes, for each camera, the standard deviation (px, 2D) of its image of the subject's region, after aligning
-    worlds. ``covariance`` is the joint covariance of each camera's nine intrinsics and pose. The result estimates
-    ``image_distance(rig, true_rig)``."""
+    worlds. ``covariance`` is the joint covariance of each camera's nine intrinsics and pose. The
+    standard deviation estimates ``image_distance`` from the rig to the true rig."""
     points, count = subject_points(rig), len(rig)
     by_pose = [pose_jacobian(camera, points).reshape(-1, 6) for camera in rig]
     by_lens = [intrinsics_jacobian(camera, points).reshape(-1, 9) for camera in rig]

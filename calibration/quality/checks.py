@@ -239,7 +239,7 @@ class CameraEvidence:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Holds the verdict on a calibration: good, usable or poor. ``missing`` lists improvements, most urgent first."""
+    """Holds the verdict on a calibration: good, usable or poor. ``missing`` lists remedies, most urgent first."""
 
     word: Word
     missing: tuple[Message, ...]

@@ -58,9 +58,9 @@ def vote(
 
     A view's vote is the distance to the tangent plane of the pixel at the node's projection. Votes are limited to
     ``reach`` in front of the plane, and left out if the node lies more than ``behind`` behind it. The value is the mean
-    of the votes that agree with their weighted median; the weight falls with the square of their fraction. A node
-    without any view's vote has weight 0 (or ``UNDECIDED``). The value of a node without votes is the distance to the
-    visual hull, or to the back of a body of limited thickness behind a seen surface.
+    of the views' votes near their weighted median; the weight is multiplied by the square of the share that lies there.
+    A node without any view's vote has weight 0 (or ``UNDECIDED``). The value of a node without votes is the distance to
+    the visual hull, or to the back of a body of limited thickness behind a seen surface.
 
     ``index`` (n, 3) and ``corner`` (3, world frame, mm) give the positions of nodes, ``step_mm`` apart. ``limits`` are
     reach, behind, largest difference of agreeing votes, the deviation (mm) of unit weight and the lower limit of

@@ -164,8 +164,8 @@ def _concerns(message: Message, code: str) -> bool:
 
 
 def _as_cut(share: Float32[np.ndarray, "h w"], counted: Bool[np.ndarray, "h w"] | None = None) -> Silhouette:
-    """Returns the silhouette of a view whose mask was cut along image edges. The outline is weak where overlapping
-    windows of the cut disagree. Only the outline of the pixels ``counted`` is judged; None means all pixels."""
+    """Returns the silhouette of a view whose mask was cut along image edges. The outline is doubtful where overlapping
+    windows, each cut alone, disagree. Only the outline of the pixels ``counted`` is judged; None means all pixels."""
     alpha, holes = _without_specks(share, np.zeros_like(share))
     mask = alpha > 0.5
     undecided = dilate(np.abs(share - 0.5) < UNDECIDED, 1)

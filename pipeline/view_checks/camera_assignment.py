@@ -47,8 +47,8 @@ MIN_CAMERAS = 3
 @dataclass(frozen=True, slots=True, eq=False)
 class Assignment:
     """Holds the exchange of pictures among cameras. For every camera that has another camera's picture, ``pictures``
-    has the name under which its own picture is filed. ``overwhelming`` is True if the exchange reduces the misfit of
-    the tangent planes so much that it is certain.
+    has the name under which its own picture is filed. ``overwhelming``: the exchange is certain, since the outlines'
+    tangents that cameras share fit much better with it.
     """
 
     pictures: Mapping[str, str]

@@ -171,7 +171,8 @@ def adjusted(
     """Returns the rig's configuration with changed camera settings (``exposure_ms``, ``gain_db``, ``white_balance_k``)
     and lamps.
 
-    If ``outputs`` is None, the lamps of rig.toml are kept. Raises InputError naming every fault."""
+    ``outputs``: the trigger box's outputs that switch lamps; None keeps those of rig.toml. Raises
+    InputError naming every fault."""
     changed = dataclasses.replace(
         config,
         cameras=tuple(dataclasses.replace(camera, **cameras.get(camera.name, {})) for camera in config.cameras),

@@ -41,7 +41,7 @@ def is_name(name: str) -> bool:
 
 
 def templates_folder() -> Path:
-    """Returns the folder that holds the registered templates. The returned folder may not exist yet."""
+    """Returns the folder of the registered templates, which exists once the first template is registered."""
     return data_folder() / "templates"
 
 

@@ -310,7 +310,7 @@ def sized(folder: Path, name: str, faults: list[Message]) -> tuple[int, int]:
     """Returns width and height (px) of the picture of camera ``name`` in ``folder`` or ``folder/images``, for file
     formats that do not state sizes.
 
-    Without a picture, appends a fault that says where to put the picture, and returns a placeholder size."""
+    If the camera has no picture, appends to ``faults`` where to put one, and returns a placeholder size."""
     from rig.formats.pictures.images import picture_size  # decoders, which most formats do without
 
     for place in (folder, entry(folder, "images"), entry(folder.parent, "images")):

@@ -144,7 +144,7 @@ TEMPLATES = {
     "object-url-not-allowed": "the address lies outside the places that the operator allowed: {prefixes}",
     "key-characters": "the address has control characters or backslashes in its key",
     "key-long": "the address has a key of more than {most} bytes",
-    "key-parts": "the address has an empty part, . or .. in its key",
+    "key-parts": "the address has an empty part, . or .. in its path",
     "multipart-wanted": "Send multipart/form-data with the archive as the part 'file'.",
     "multipart-boundary-wrong": "The multipart boundary is no good ({reason}).",
     "multipart-malformed": "The body is no multipart/form-data ({reason}).",

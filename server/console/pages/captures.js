@@ -395,8 +395,8 @@ export default spoken({
                 <option v-for="s in sessions" :key="s.id" :value="s.id">{{ name(s) }}</option>
               </select>
             </label>
-            <label v-if="!current.frames" class="field" :title="say(preset?.explanation)">Settings<select v-model="method" id="method"
-              aria-describedby="preset">
+            <label v-if="!current.frames" class="field" :title="say(preset?.explanation)">Settings<select
+              v-model="method" id="method" aria-describedby="preset">
                 <option v-for="p in state.presets" :key="p.id" :value="p.id">{{ say(p.title) }}</option>
               </select>
             </label>
@@ -419,8 +419,8 @@ export default spoken({
             style="margin-bottom: .7rem">
             <span class="muted">Jobs</span>
             <a v-for="j in current.jobs.slice(0, 12)" :key="j.id" class="tag" :class="jobKind(j)"
-              :href="j.state === 'succeeded' && !current.frames ? '/result/' + j.id
-                : '/jobs?job=' + j.id">{{ say(j.state !== 'succeeded' ? j.state : current.frames ? 'tracked' : 'head') }}
+              :href="j.state === 'succeeded' && !current.frames ? '/result/' + j.id : '/jobs?job=' + j.id">{{
+                say(j.state !== 'succeeded' ? j.state : current.frames ? 'tracked' : 'head') }}
                 {{ j.progress === null ? j.id.slice(-6) : Math.round(100 * j.progress) + ' %' }}</a>
             <a v-if="current.jobs.length > 12"
               :href="'/jobs?find=' + current.id">{{ say('all {count}', { count: current.jobs.length }) }}</a>
@@ -435,7 +435,8 @@ export default spoken({
               :style="{ aspectRatio: current.size.width + ' / ' + current.size.height }"
               :aria-label="say('Enlarge {name}', { name: camera })" @click="large = i">
               <img :src="address(camera, '.jpg')" :alt="say('Picture of {name}', { name: camera })" loading="lazy">
-              <img v-if="outlines && current.kind === 'shot'" :src="address(camera, '.silhouette.png')" alt="" @error="failed">
+              <img v-if="outlines && current.kind === 'shot'" alt="" @error="failed"
+                :src="address(camera, '.silhouette.png')">
               <outline v-else :view="view(current.id, camera)" :size="current.sizes[camera]"></outline>
               <face-marks :faces="facesIn(current.id, camera)" :size="current.sizes[camera]"></face-marks>
               <span>{{ camera }}{{ camera === current.front ? ' · ' + say('front') : '' }} <b
@@ -457,7 +458,8 @@ export default spoken({
             <div class="thumb" style="aspect-ratio: auto">
               <img :src="address(current.cameras[large], '.image')"
                 :alt="say('Picture of {name}', { name: current.cameras[large] })">
-              <img v-if="outlines && current.kind === 'shot'" :src="address(current.cameras[large], '.silhouette.png')" alt="">
+              <img v-if="outlines && current.kind === 'shot'" alt=""
+                :src="address(current.cameras[large], '.silhouette.png')">
               <face-marks :faces="facesIn(current.id, current.cameras[large])"
                 :size="current.sizes[current.cameras[large]]"></face-marks>
             </div>
