@@ -126,4 +126,5 @@ def test_three_js_shows_the_head_as_we_do(name: str, result: Path, site: tuple[P
     core = cv2.GaussianBlur(np.asarray(inside, np.float32), (0, 0), 5.0) > 0.99
     assert np.median(np.abs(even[0] - even[1])[core]) <= 2
     fine = [np.abs(cv2.Laplacian(image, cv2.CV_32F))[core].mean() for image in (seen, ours)]
-    assert fine[0] > (1.1 if name == "head.glb" else 1.0) * fine[1]  # a bust's pixels are 2 mm wide
+    # A bust's pixels of 2 mm are wider than its triangles of 1.5 mm, so that both show as much, to a hundredth.
+    assert fine[0] > (1.1 if name == "head.glb" else 0.98) * fine[1]
